@@ -41,7 +41,10 @@ impl OccupancyGrid {
 
     /// A point of `map` [m] in grid coordinates [cells]: the centre of cell (0, 0) is (0.5, 0.5).
     pub fn to_grid(&self, point: [f64; 2]) -> [f64; 2] {
-        self.origin.inverse().transform(point).map(|v| v / self.resolution)
+        self.origin
+            .inverse()
+            .transform(point)
+            .map(|v| v / self.resolution)
     }
 
     /// A point in grid coordinates [cells], in `map` [m].
@@ -67,7 +70,14 @@ mod tests {
             height: 2,
             resolution: 0.05,
             origin: Pose::new(25.9, 48.5, 3.0),
-            cells: vec![Cell::Free, Cell::Free, Cell::Occupied, Cell::Free, Cell::Unknown, Cell::Free],
+            cells: vec![
+                Cell::Free,
+                Cell::Free,
+                Cell::Occupied,
+                Cell::Free,
+                Cell::Unknown,
+                Cell::Free,
+            ],
         }
     }
 

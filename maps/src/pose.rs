@@ -7,7 +7,11 @@ use serde::{Deserialize, Serialize};
 
 /// Wraps an angle to `[-pi, pi)` [rad].
 pub fn wrap_angle(angle: f64) -> f64 {
-    if (-PI..PI).contains(&angle) { angle } else { (angle + PI).rem_euclid(TAU) - PI }
+    if (-PI..PI).contains(&angle) {
+        angle
+    } else {
+        (angle + PI).rem_euclid(TAU) - PI
+    }
 }
 
 /// A pose in the plane, which is also the rigid transform SE(2) that puts a frame there.
@@ -33,24 +37,39 @@ pub struct Pose {
 
 impl Pose {
     /// The transform that changes nothing.
-    pub const IDENTITY: Self = Self { x: 0.0, y: 0.0, heading: 0.0 };
+    pub const IDENTITY: Self = Self {
+        x: 0.0,
+        y: 0.0,
+        heading: 0.0,
+    };
 
     /// A pose at (`x`, `y`) [m] heading `heading` [rad], which is wrapped.
     pub fn new(x: f64, y: f64, heading: f64) -> Self {
-        Self { x, y, heading: wrap_angle(heading) }
+        Self {
+            x,
+            y,
+            heading: wrap_angle(heading),
+        }
     }
 
     /// The transform that undoes this one.
     #[must_use]
     pub fn inverse(self) -> Self {
         let (sin, cos) = self.heading.sin_cos();
-        Self::new(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, -self.heading)
+        Self::new(
+            -cos * self.x - sin * self.y,
+            sin * self.x - cos * self.y,
+            -self.heading,
+        )
     }
 
     /// A point of the source frame, in the target frame [m].
     pub fn transform(self, point: [f64; 2]) -> [f64; 2] {
         let (sin, cos) = self.heading.sin_cos();
-        [self.x + cos * point[0] - sin * point[1], self.y + sin * point[0] + cos * point[1]]
+        [
+            self.x + cos * point[0] - sin * point[1],
+            self.y + sin * point[0] + cos * point[1],
+        ]
     }
 
     /// The motion that leads from `earlier` to `self`, in the frame of `earlier`.
@@ -87,7 +106,11 @@ impl Pose {
     pub fn log(self) -> [f64; 3] {
         let omega = self.heading;
         let half = omega / 2.0;
-        let cot = if omega.abs() < 1e-6 { 1.0 - omega * omega / 12.0 } else { half / half.tan() };
+        let cot = if omega.abs() < 1e-6 {
+            1.0 - omega * omega / 12.0
+        } else {
+            half / half.tan()
+        };
         [cot * self.x + half * self.y, cot * self.y - half * self.x, omega]
     }
 

@@ -1,0 +1,71 @@
+//! What the sensors deliver.
+
+use maps::Pose;
+use serde::{Deserialize, Serialize};
+
+/// A sensor's time: nanoseconds since the Unix epoch (or since any epoch that all sensors share).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+pub struct Stamp(pub i64);
+
+impl Stamp {
+    /// Seconds from `earlier` to this stamp; negative when it is the later one [s].
+    pub fn since(self, earlier: Self) -> f64 {
+        self.0.saturating_sub(earlier.0) as f64 * 1e-9
+    }
+
+    /// The stamp `seconds` later.
+    #[must_use]
+    pub fn plus(self, seconds: f64) -> Self {
+        Self(self.0.saturating_add((seconds * 1e9).round() as i64))
+    }
+}
+
+/// One sweep of a planar laser scanner, as `sensor_msgs/LaserScan` has it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scan {
+    /// When the first beam was measured.
+    pub stamp: Stamp,
+    /// Direction of the first beam in the laser's frame [rad].
+    pub angle_min: f64,
+    /// Angle from one beam to the next, signed [rad].
+    pub angle_increment: f64,
+    /// Time from one beam to the next; 0 when the whole scan has one time [s].
+    pub time_increment: f64,
+    /// Readings below this are no measurement [m].
+    pub range_min: f64,
+    /// Readings from here on mean "nothing in range" [m].
+    pub range_max: f64,
+    /// One reading per beam [m]; NaN and infinities are allowed and mean "no return".
+    pub ranges: Vec<f32>,
+}
+
+/// A velocity in the frame of `base_link`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Twist {
+    /// Forward speed [m/s].
+    pub linear_x: f64,
+    /// Speed to the left [m/s].
+    pub linear_y: f64,
+    /// Yaw rate, left positive [rad/s].
+    pub angular: f64,
+}
+
+/// One message of wheel odometry, as `nav_msgs/Odometry` has it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Odometry {
+    /// When it was true.
+    pub stamp: Stamp,
+    /// `odom_from_base_link`: drifts, but does not jump.
+    pub pose: Pose,
+    /// Velocity at that time.
+    pub twist: Twist,
+}
+
+/// A gyroscope's reading.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct YawRate {
+    /// When it was true.
+    pub stamp: Stamp,
+    /// Yaw rate, left positive [rad/s].
+    pub rate: f64,
+}

@@ -2,10 +2,17 @@
 //!
 //! Everything here is pure but for the loaders, which read files. Nothing here knows of particles, cars
 //! or networks.
+mod error;
 mod grid;
+mod map_file;
+mod polyline;
 mod pose;
 mod raceline;
+mod raceline_file;
+mod raster;
 
+pub use error::MapError;
 pub use grid::{Cell, OccupancyGrid};
+pub use map_file::{MapMetadata, MapMode};
 pub use pose::{Pose, wrap_angle};
-pub use raceline::{Raceline, RacelinePoint, TrackPosition};
+pub use raceline::{Raceline, RacelineFault, RacelinePoint, TrackPosition};

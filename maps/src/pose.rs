@@ -123,6 +123,10 @@ impl Pose {
 impl Mul for Pose {
     type Output = Self;
 
+    #[allow(
+        clippy::suspicious_arithmetic_impl,
+        reason = "headings of chained transforms add up"
+    )]
     fn mul(self, source: Self) -> Self {
         let [x, y] = self.transform([source.x, source.y]);
         Self::new(x, y, self.heading + source.heading)

@@ -1,0 +1,362 @@
+//! Maps on disk and over the network: `map_server`'s YAML beside an image.
+//!
+//! The semantics are those of `nav2_map_server` (`map_io.cpp`): an image's brightness becomes an occupancy, two
+//! thresholds make it free, occupied or unknown. Localization knows only these three, so `scale` and `raw` maps
+//! keep what is clearly free or occupied, and everything in between is [`Cell::Unknown`].
+
+use std::fs;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::raster::{Raster, encode_png};
+use crate::{Cell, MapError, OccupancyGrid, Pose};
+
+/// Grey values that `map_saver` writes, which every reader's default thresholds tell apart.
+const FREE: u8 = 254;
+const OCCUPIED: u8 = 0;
+const UNKNOWN: u8 = 205;
+
+/// The YAML file of a map.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MapMetadata {
+    /// The image's file, relative to the YAML file.
+    pub image: String,
+    /// Edge of a pixel [m].
+    pub resolution: f64,
+    /// Lower left corner of the image in `map`: x [m], y [m], yaw [rad].
+    pub origin: [f64; 3],
+    /// True when white means occupied.
+    pub negate: bool,
+    /// Pixels darker than this share of black are occupied, in [0, 1].
+    pub occupied_thresh: f64,
+    /// Pixels brighter than this share of black are free, in [0, 1].
+    pub free_thresh: f64,
+    /// How brightness becomes occupancy.
+    pub mode: MapMode,
+}
+
+/// How `map_server` makes occupancy of brightness.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MapMode {
+    /// Free, occupied or unknown; alpha counts as a colour.
+    #[default]
+    Trinary,
+    /// Values between the thresholds are kept by `map_server` (unknown here); transparent is unknown.
+    Scale,
+    /// The pixel value (of 255) is the occupancy in percent; above 100 is unknown.
+    Raw,
+}
+
+/// The file as people write it. Other keys are ignored, as `map_server` does.
+#[derive(Deserialize)]
+struct RawMetadata {
+    image: Option<String>,
+    resolution: Option<f64>,
+    origin: Option<Vec<f64>>,
+    negate: Option<Negate>,
+    occupied_thresh: Option<f64>,
+    free_thresh: Option<f64>,
+    mode: Option<String>,
+}
+
+/// `map_server` writes 0 or 1, people write true and false.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Negate {
+    Number(i64),
+    Flag(bool),
+}
+
+impl MapMetadata {
+    /// Reads the YAML; `file` names it in errors.
+    pub fn parse(file: &str, yaml: &str) -> Result<Self, MapError> {
+        let raw: RawMetadata = serde_saphyr::from_str(yaml)
+            .map_err(|e| MapError::format(file, e.without_snippet().to_string()))?;
+        let missing = |key| MapError::key(file, key, "missing");
+        let origin = raw.origin.ok_or_else(|| missing("origin"))?;
+        let origin = <[f64; 3]>::try_from(origin.as_slice())
+            .ok()
+            .filter(|origin| origin.iter().all(|v| v.is_finite()))
+            .ok_or_else(|| {
+                let fault = format!("{origin:?} should be three finite numbers: x [m], y [m], yaw [rad]");
+                MapError::key(file, "origin", fault)
+            })?;
+        let resolution = raw.resolution.ok_or_else(|| missing("resolution"))?;
+        // Not `<= 0.0`: NaN must fail too.
+        if !(resolution.is_finite() && resolution > 0.0) {
+            let fault = format!("{resolution} should be a positive length in metres");
+            return Err(MapError::key(file, "resolution", fault));
+        }
+        let share = |key, value: Option<f64>, default| match value.unwrap_or(default) {
+            value if (0.0..=1.0).contains(&value) => Ok(value),
+            value => Err(MapError::key(file, key, format!("{value} should lie in [0, 1]"))),
+        };
+        let occupied_thresh = share("occupied_thresh", raw.occupied_thresh, 0.65)?;
+        let free_thresh = share("free_thresh", raw.free_thresh, 0.196)?;
+        if free_thresh > occupied_thresh {
+            let fault = format!("{free_thresh} is above occupied_thresh {occupied_thresh}");
+            return Err(MapError::key(file, "free_thresh", fault));
+        }
+        Ok(Self {
+            image: raw.image.ok_or_else(|| missing("image"))?,
+            resolution,
+            origin,
+            negate: match raw.negate {
+                None | Some(Negate::Number(0) | Negate::Flag(false)) => false,
+                Some(Negate::Number(1) | Negate::Flag(true)) => true,
+                Some(Negate::Number(other)) => {
+                    return Err(MapError::key(file, "negate", format!("{other} should be 0 or 1")));
+                }
+            },
+            occupied_thresh,
+            free_thresh,
+            mode: match raw.mode.as_deref() {
+                None | Some("trinary") => MapMode::Trinary,
+                Some("scale") => MapMode::Scale,
+                Some("raw") => MapMode::Raw,
+                Some(other) => {
+                    let fault = format!("{other:?} should be trinary, scale or raw");
+                    return Err(MapError::key(file, "mode", fault));
+                }
+            },
+        })
+    }
+
+    fn cell(&self, image: &Raster, index: usize) -> Cell {
+        let occupancy = match self.mode {
+            MapMode::Raw => {
+                let percent = (image.brightness(index) * 255.0).round();
+                if percent > 100.0 {
+                    return Cell::Unknown;
+                }
+                percent / 100.0
+            }
+            MapMode::Scale if !image.opaque(index) => return Cell::Unknown,
+            MapMode::Scale => self.darkness(image.brightness(index)),
+            MapMode::Trinary => self.darkness(image.brightness_with_alpha(index)),
+        };
+        if occupancy > self.occupied_thresh {
+            Cell::Occupied
+        } else if occupancy < self.free_thresh {
+            Cell::Free
+        } else {
+            Cell::Unknown
+        }
+    }
+
+    fn darkness(&self, brightness: f64) -> f64 {
+        if self.negate { brightness } else { 1.0 - brightness }
+    }
+}
+
+impl OccupancyGrid {
+    /// Reads a map: `path` is the YAML file, which names the image beside it.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
+        let path = path.as_ref();
+        let file = path.display().to_string();
+        let yaml = fs::read_to_string(path).map_err(|source| MapError::Read {
+            file: file.clone(),
+            source,
+        })?;
+        let metadata = MapMetadata::parse(&file, &yaml)?;
+        let image = path.parent().unwrap_or(Path::new("")).join(&metadata.image);
+        let bytes = fs::read(&image).map_err(|e| {
+            let fault = format!("{}: {e}", image.display());
+            MapError::key(&file, "image", fault)
+        })?;
+        Self::decode(&metadata, &image.display().to_string(), &bytes)
+    }
+
+    /// A map that did not come from files: the text of its YAML and the bytes of its image.
+    pub fn from_parts(yaml: &str, image: &[u8]) -> Result<Self, MapError> {
+        let metadata = MapMetadata::parse("map.yaml", yaml)?;
+        Self::decode(&metadata, &metadata.image, image)
+    }
+
+    fn decode(metadata: &MapMetadata, file: &str, image: &[u8]) -> Result<Self, MapError> {
+        let image = Raster::decode(file, image)?;
+        let (width, height) = (image.width, image.height);
+        // The image's first row is the map's last.
+        let cells = (0..height)
+            .rev()
+            .flat_map(|row| (0..width).map(move |column| row * width + column))
+            .map(|index| metadata.cell(&image, index))
+            .collect();
+        let [x, y, yaw] = metadata.origin;
+        Ok(Self {
+            width,
+            height,
+            resolution: metadata.resolution,
+            origin: Pose::new(x, y, yaw),
+            cells,
+        })
+    }
+
+    /// The YAML that goes with [`OccupancyGrid::to_png`], naming the image `image`.
+    pub fn to_yaml(&self, image: &str) -> String {
+        // `{:?}` writes a float so that it reads back as itself, and quotes the name where it must.
+        format!(
+            "image: {image:?}\nresolution: {:?}\norigin: [{:?}, {:?}, {:?}]\nnegate: 0\noccupied_thresh: 0.65\n\
+             free_thresh: 0.196\nmode: trinary\n",
+            self.resolution, self.origin.x, self.origin.y, self.origin.heading
+        )
+    }
+
+    /// The map as an 8-bit grey PNG, in the grey values of `map_saver`.
+    pub fn to_png(&self) -> Vec<u8> {
+        let grey: Vec<u8> = self
+            .cells
+            .chunks_exact(self.width)
+            .rev()
+            .flatten()
+            .map(|cell| match cell {
+                Cell::Free => FREE,
+                Cell::Occupied => OCCUPIED,
+                Cell::Unknown => UNKNOWN,
+            })
+            .collect();
+        encode_png(self.width, self.height, &grey)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const YAML: &str = "image: map.pgm\nresolution: 0.05\norigin: [1.0, 2.0, 3.1]\nnegate: 0\n\
+                        occupied_thresh: 0.65\nfree_thresh: 0.196\n";
+
+    fn cells(yaml: &str, image: &[u8]) -> Vec<Cell> {
+        OccupancyGrid::from_parts(yaml, image).expect("a valid map").cells
+    }
+
+    #[test]
+    fn the_image_s_last_row_is_row_zero() {
+        let grid = OccupancyGrid::from_parts(YAML, b"P2 2 2 255 0 205 254 255").expect("a valid map");
+        assert_eq!(
+            grid.cells,
+            [Cell::Free, Cell::Free, Cell::Occupied, Cell::Unknown]
+        );
+        assert_eq!(grid.origin, Pose::new(1.0, 2.0, 3.1));
+        // Turned by nearly pi, the grid lies to the lower left of its origin.
+        assert_eq!(grid.at([0.975, 1.925]), Cell::Occupied);
+    }
+
+    #[test]
+    fn negate_swaps_black_and_white() {
+        let yaml = YAML.replace("negate: 0", "negate: 1");
+        assert_eq!(cells(&yaml, b"P2 2 1 255 255 0"), [Cell::Occupied, Cell::Free]);
+        let yaml = YAML.replace("negate: 0", "negate: true");
+        assert_eq!(cells(&yaml, b"P2 1 1 255 255"), [Cell::Occupied]);
+    }
+
+    #[test]
+    fn raw_values_are_percent() {
+        let yaml = format!("{YAML}mode: raw\n");
+        assert_eq!(
+            cells(&yaml, b"P2 5 1 255 0 19 50 66 101"),
+            [
+                Cell::Free,
+                Cell::Free,
+                Cell::Unknown,
+                Cell::Occupied,
+                Cell::Unknown
+            ]
+        );
+    }
+
+    #[test]
+    fn scale_keeps_what_is_clear() {
+        let yaml = format!("{YAML}mode: scale\n");
+        assert_eq!(
+            cells(&yaml, b"P2 3 1 255 0 127 255"),
+            [Cell::Occupied, Cell::Unknown, Cell::Free]
+        );
+    }
+
+    #[test]
+    fn thresholds_are_strict_as_in_map_server() {
+        // 1 - 0.5 is exactly 0.5: neither above nor below.
+        let yaml = YAML.replace("0.65", "0.5").replace("0.196", "0.5");
+        assert_eq!(
+            cells(&yaml, b"P2 3 1 10 4 5 6"),
+            [Cell::Occupied, Cell::Unknown, Cell::Free]
+        );
+    }
+
+    #[test]
+    fn faults_name_file_and_key() {
+        for (from, to, expected) in [
+            ("resolution: 0.05", "", "map.yaml: resolution: missing"),
+            ("resolution: 0.05", "resolution: -1", "map.yaml: resolution: -1"),
+            (
+                "resolution: 0.05",
+                "resolution: .nan",
+                "map.yaml: resolution: NaN",
+            ),
+            ("resolution: 0.05", "resolution: five", "map.yaml: "),
+            ("image: map.pgm", "", "map.yaml: image: missing"),
+            ("[1.0, 2.0, 3.1]", "[1.0, 2.0]", "map.yaml: origin: "),
+            ("[1.0, 2.0, 3.1]", "[1.0, .inf, 0]", "map.yaml: origin: "),
+            ("negate: 0", "negate: 2", "map.yaml: negate: 2"),
+            ("0.65", "1.65", "map.yaml: occupied_thresh: 1.65"),
+            ("0.196", "0.7", "map.yaml: free_thresh: 0.7"),
+            ("negate: 0", "mode: grey", "map.yaml: mode: \"grey\""),
+        ] {
+            let error = OccupancyGrid::from_parts(&YAML.replace(from, to), b"P2 1 1 255 0")
+                .expect_err("a fault in the YAML");
+            assert!(
+                error.to_string().starts_with(expected),
+                "{error} should start with {expected}"
+            );
+        }
+        let error = OccupancyGrid::from_parts(YAML, b"").expect_err("no image");
+        assert!(error.to_string().starts_with("map.pgm: "), "{error}");
+        let error = OccupancyGrid::from_parts("- a list", b"").expect_err("not a map");
+        assert!(error.to_string().starts_with("map.yaml: "), "{error}");
+    }
+
+    #[test]
+    fn files_beside_each_other() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let yaml = folder.path().join("track.yaml");
+        fs::write(&yaml, YAML).expect("writable");
+        let error = OccupancyGrid::load(&yaml).expect_err("no image yet");
+        assert!(error.to_string().contains("track.yaml: image: "), "{error}");
+        fs::write(folder.path().join("map.pgm"), b"P5 2 1 255\n\x00\xfe").expect("writable");
+        let grid = OccupancyGrid::load(&yaml).expect("a valid map");
+        assert_eq!(grid.cells, [Cell::Occupied, Cell::Free]);
+        let error = OccupancyGrid::load(folder.path().join("absent.yaml")).expect_err("no file");
+        assert!(error.to_string().contains("absent.yaml"), "{error}");
+    }
+
+    fn any_grid() -> impl Strategy<Value = OccupancyGrid> {
+        let cell = prop_oneof![Just(Cell::Free), Just(Cell::Occupied), Just(Cell::Unknown)];
+        (
+            1_usize..12,
+            1_usize..12,
+            0.001..1.0,
+            (-9.0..9.0, -9.0..9.0, -3.0..3.0),
+        )
+            .prop_flat_map(move |(width, height, resolution, (x, y, yaw))| {
+                proptest::collection::vec(cell.clone(), width * height).prop_map(move |cells| OccupancyGrid {
+                    width,
+                    height,
+                    resolution,
+                    origin: Pose::new(x, y, yaw),
+                    cells,
+                })
+            })
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_saved_reads_back(grid in any_grid()) {
+            let back = OccupancyGrid::from_parts(&grid.to_yaml("a map.png"), &grid.to_png());
+            prop_assert_eq!(back.expect("just written"), grid);
+        }
+    }
+}

@@ -27,9 +27,33 @@ pub struct OccupancyGrid {
     pub origin: Pose,
     /// `width * height` cells, row by row from the bottom.
     pub cells: Vec<Cell>,
+    /// How much of each cell is wall, 0 (none) to 255 (all), in the order of `cells`: the grey of the map's
+    /// image. Maps drawn or edited with anti-aliasing say with it where in a cell a wall's face lies.
+    pub occupancy: Vec<u8>,
 }
 
 impl OccupancyGrid {
+    /// A grid of which only the cells' states are known. Panics unless there are `width * height` cells.
+    pub fn new(width: usize, height: usize, resolution: f64, origin: Pose, cells: Vec<Cell>) -> Self {
+        assert_eq!(cells.len(), width * height, "one cell per place");
+        let occupancy = cells
+            .iter()
+            .map(|cell| match cell {
+                Cell::Free => 0,
+                Cell::Unknown => 128,
+                Cell::Occupied => 255,
+            })
+            .collect();
+        Self {
+            width,
+            height,
+            resolution,
+            origin,
+            cells,
+            occupancy,
+        }
+    }
+
     /// The cell at (`column`, `row`); [`Cell::Unknown`] outside the grid.
     pub fn cell(&self, column: i64, row: i64) -> Cell {
         if (0..self.width as i64).contains(&column) && (0..self.height as i64).contains(&row) {
@@ -65,20 +89,15 @@ mod tests {
     use proptest::prelude::*;
 
     fn grid() -> OccupancyGrid {
-        OccupancyGrid {
-            width: 3,
-            height: 2,
-            resolution: 0.05,
-            origin: Pose::new(25.9, 48.5, 3.0),
-            cells: vec![
-                Cell::Free,
-                Cell::Free,
-                Cell::Occupied,
-                Cell::Free,
-                Cell::Unknown,
-                Cell::Free,
-            ],
-        }
+        let cells = vec![
+            Cell::Free,
+            Cell::Free,
+            Cell::Occupied,
+            Cell::Free,
+            Cell::Unknown,
+            Cell::Free,
+        ];
+        OccupancyGrid::new(3, 2, 0.05, Pose::new(25.9, 48.5, 3.0), cells)
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //!
 //! Everything here is pure but for the loaders, which read files. Nothing here knows of particles, cars
 //! or networks.
+mod distance_field;
 mod error;
 mod grid;
 mod map_file;
@@ -10,7 +11,9 @@ mod pose;
 mod raceline;
 mod raceline_file;
 mod raster;
+mod ray_cast;
 
+pub use distance_field::{DistanceField, Sample};
 pub use error::MapError;
 pub use grid::{Cell, OccupancyGrid};
 pub use map_file::{MapMetadata, MapMode};

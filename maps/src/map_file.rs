@@ -17,6 +17,10 @@ const FREE: u8 = 254;
 const OCCUPIED: u8 = 0;
 const UNKNOWN: u8 = 205;
 
+/// Thresholds of `map_saver`, for files that give none.
+const OCCUPIED_THRESH: f64 = 0.65;
+const FREE_THRESH: f64 = 0.196;
+
 /// The YAML file of a map.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MapMetadata {
@@ -93,8 +97,8 @@ impl MapMetadata {
             value if (0.0..=1.0).contains(&value) => Ok(value),
             value => Err(MapError::key(file, key, format!("{value} should lie in [0, 1]"))),
         };
-        let occupied_thresh = share("occupied_thresh", raw.occupied_thresh, 0.65)?;
-        let free_thresh = share("free_thresh", raw.free_thresh, 0.196)?;
+        let occupied_thresh = share("occupied_thresh", raw.occupied_thresh, OCCUPIED_THRESH)?;
+        let free_thresh = share("free_thresh", raw.free_thresh, FREE_THRESH)?;
         if free_thresh > occupied_thresh {
             let fault = format!("{free_thresh} is above occupied_thresh {occupied_thresh}");
             return Err(MapError::key(file, "free_thresh", fault));
@@ -124,25 +128,24 @@ impl MapMetadata {
         })
     }
 
-    fn cell(&self, image: &Raster, index: usize) -> Cell {
-        let occupancy = match self.mode {
+    /// Share of a pixel that is wall, in [0, 1]; None where the image says that nobody knows.
+    fn occupancy(&self, image: &Raster, index: usize) -> Option<f64> {
+        match self.mode {
             MapMode::Raw => {
                 let percent = (image.brightness(index) * 255.0).round();
-                if percent > 100.0 {
-                    return Cell::Unknown;
-                }
-                percent / 100.0
+                (percent <= 100.0).then_some(percent / 100.0)
             }
-            MapMode::Scale if !image.opaque(index) => return Cell::Unknown,
-            MapMode::Scale => self.darkness(image.brightness(index)),
-            MapMode::Trinary => self.darkness(image.brightness_with_alpha(index)),
-        };
-        if occupancy > self.occupied_thresh {
-            Cell::Occupied
-        } else if occupancy < self.free_thresh {
-            Cell::Free
-        } else {
-            Cell::Unknown
+            MapMode::Scale if !image.opaque(index) => None,
+            MapMode::Scale => Some(self.darkness(image.brightness(index))),
+            MapMode::Trinary => Some(self.darkness(image.brightness_with_alpha(index))),
+        }
+    }
+
+    fn cell(&self, occupancy: Option<f64>) -> Cell {
+        match occupancy {
+            Some(occupancy) if occupancy > self.occupied_thresh => Cell::Occupied,
+            Some(occupancy) if occupancy < self.free_thresh => Cell::Free,
+            _ => Cell::Unknown,
         }
     }
 
@@ -179,11 +182,14 @@ impl OccupancyGrid {
         let image = Raster::decode(file, image)?;
         let (width, height) = (image.width, image.height);
         // The image's first row is the map's last.
-        let cells = (0..height)
+        let (cells, occupancy) = (0..height)
             .rev()
             .flat_map(|row| (0..width).map(move |column| row * width + column))
-            .map(|index| metadata.cell(&image, index))
-            .collect();
+            .map(|index| {
+                let occupancy = metadata.occupancy(&image, index);
+                (metadata.cell(occupancy), grey(occupancy.unwrap_or(0.5)))
+            })
+            .unzip();
         let [x, y, yaw] = metadata.origin;
         Ok(Self {
             width,
@@ -191,6 +197,7 @@ impl OccupancyGrid {
             resolution: metadata.resolution,
             origin: Pose::new(x, y, yaw),
             cells,
+            occupancy,
         })
     }
 
@@ -204,21 +211,34 @@ impl OccupancyGrid {
         )
     }
 
-    /// The map as an 8-bit grey PNG, in the grey values of `map_saver`.
+    /// The map as an 8-bit grey PNG: 255 less the occupancy, or, where that would read back as another state,
+    /// the grey value of `map_saver`.
     pub fn to_png(&self) -> Vec<u8> {
-        let grey: Vec<u8> = self
+        let pixel = |(&cell, &occupancy): (&Cell, &u8)| {
+            let share = f64::from(occupancy) / 255.0;
+            let (free, occupied) = (share < FREE_THRESH, share > OCCUPIED_THRESH);
+            match cell {
+                Cell::Free if !free => FREE,
+                Cell::Occupied if !occupied => OCCUPIED,
+                Cell::Unknown if free || occupied => UNKNOWN,
+                _ => 255 - occupancy,
+            }
+        };
+        let rows = self
             .cells
             .chunks_exact(self.width)
+            .zip(self.occupancy.chunks_exact(self.width));
+        let grey: Vec<u8> = rows
             .rev()
-            .flatten()
-            .map(|cell| match cell {
-                Cell::Free => FREE,
-                Cell::Occupied => OCCUPIED,
-                Cell::Unknown => UNKNOWN,
-            })
+            .flat_map(|(cells, occupancy)| cells.iter().zip(occupancy).map(pixel))
             .collect();
         encode_png(self.width, self.height, &grey)
     }
+}
+
+/// An occupancy in [0, 1] as a grey value, 255 all wall.
+fn grey(occupancy: f64) -> u8 {
+    (occupancy * 255.0).round() as u8
 }
 
 #[cfg(test)]
@@ -342,12 +362,8 @@ mod tests {
             (-9.0..9.0, -9.0..9.0, -3.0..3.0),
         )
             .prop_flat_map(move |(width, height, resolution, (x, y, yaw))| {
-                proptest::collection::vec(cell.clone(), width * height).prop_map(move |cells| OccupancyGrid {
-                    width,
-                    height,
-                    resolution,
-                    origin: Pose::new(x, y, yaw),
-                    cells,
+                proptest::collection::vec(cell.clone(), width * height).prop_map(move |cells| {
+                    OccupancyGrid::new(width, height, resolution, Pose::new(x, y, yaw), cells)
                 })
             })
     }

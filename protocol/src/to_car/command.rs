@@ -1,0 +1,233 @@
+//! Commands.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::to_wall::set_name;
+use crate::{Invalid, Message, ParameterSet, Pose2, Schema, Topic};
+
+/// Something for a car to do, once: sent again with the same id, it gets the same answer and does nothing more.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Command {
+    /// Tells this command from every other.
+    pub id: CommandId,
+    /// Who gives it, at most [`Command::MAX_OPERATOR`] bytes.
+    pub operator: String,
+    /// Only if the set in force has this revision; None: whatever it has.
+    pub expected_revision: Option<u64>,
+    /// What to do.
+    pub action: Action,
+}
+
+impl Command {
+    /// Longest name of an operator [bytes].
+    pub const MAX_OPERATOR: usize = 64;
+}
+
+/// What to do. Each goes under a topic of its own, so that a router can tell who may do what.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Action {
+    /// Under [`Topic::CmdParams`].
+    Params(ParamsAction),
+    /// Under [`Topic::CmdPose`]: start again from this `map_from_base_link`, true now.
+    Pose(Pose2),
+    /// Under [`Topic::CmdRelocalize`].
+    Relocalize(RelocalizeAction),
+    /// Under [`Topic::CmdRates`].
+    Rates(RatesAction),
+    /// Under [`Topic::CmdAuto`]: let the car switch sets by itself, or not.
+    Auto(bool),
+}
+
+impl Action {
+    /// The topic that it goes under.
+    pub fn topic(&self) -> Topic {
+        match self {
+            Self::Params(_) => Topic::CmdParams,
+            Self::Pose(_) => Topic::CmdPose,
+            Self::Relocalize(_) => Topic::CmdRelocalize,
+            Self::Rates(_) => Topic::CmdRates,
+            Self::Auto(_) => Topic::CmdAuto,
+        }
+    }
+}
+
+/// About parameter sets.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ParamsAction {
+    /// Put a set of the car in force.
+    Select {
+        /// Its name.
+        name: String,
+        /// Fall back by itself after this time unless confirmed [ms].
+        revert_after_ms: Option<u32>,
+    },
+    /// Store a set on the car, in place of one of the same name if that was put there before, and put it in force.
+    Put {
+        /// The set. Values not given keep what they have in the set in force.
+        set: ParameterSet,
+        /// Fall back by itself after this time unless confirmed [ms].
+        revert_after_ms: Option<u32>,
+    },
+    /// Keep the set in force: do not fall back.
+    Confirm,
+    /// Go back to the set that was in force before.
+    Revert,
+    /// Delete a set that was put on the car.
+    Delete {
+        /// Its name.
+        name: String,
+    },
+    /// Answer with all sets.
+    List,
+}
+
+/// About global relocalization.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RelocalizeAction {
+    /// Search the whole map; answer with the candidates, the best first, and follow the best one.
+    Search,
+    /// Follow another candidate of the last search.
+    Pick {
+        /// Its [`Candidate::number`](crate::Candidate::number).
+        candidate: u32,
+    },
+}
+
+/// About telemetry rates.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RatesAction {
+    /// Answer with the rates.
+    Get,
+    /// Set all rates.
+    Set(Rates),
+}
+
+/// How often a car sends what.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Rates {
+    /// Most poses per second; 0 for none, infinitely many being 1000 [Hz].
+    pub pose: f32,
+    /// Clouds per second [Hz].
+    pub cloud: f32,
+    /// Scan views per second [Hz].
+    pub scan: f32,
+    /// Health messages per second, beside those on a change of state [Hz].
+    pub health: f32,
+    /// Send the full-rate streams for the recorder.
+    pub recorded: bool,
+}
+
+impl Rates {
+    /// Highest rate that can be asked for [Hz].
+    pub const MAX: f32 = 1000.0;
+}
+
+impl Message for Command {
+    const SCHEMA: Schema = Schema::Command;
+
+    fn validate(&self) -> Result<(), Invalid> {
+        if self.operator.is_empty() {
+            return Err(Invalid::new("operator", "is empty"));
+        }
+        Invalid::unless_at_most("operator", self.operator.len(), Self::MAX_OPERATOR)?;
+        match &self.action {
+            Action::Params(ParamsAction::Select { name, .. } | ParamsAction::Delete { name }) => {
+                set_name("name", name)
+            }
+            Action::Params(ParamsAction::Put { set, .. }) => set.validate(),
+            Action::Rates(RatesAction::Set(rates)) => [
+                ("pose", rates.pose),
+                ("cloud", rates.cloud),
+                ("scan", rates.scan),
+                ("health", rates.health),
+            ]
+            .into_iter()
+            .find(|(_, rate)| !(0.0..=Rates::MAX).contains(rate))
+            .map_or(Ok(()), |(field, rate)| {
+                Err(Invalid::new(
+                    field,
+                    format!("{rate} Hz is not between 0 and {} Hz", Rates::MAX),
+                ))
+            }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Tells a command from every other: 128 random bits, 32 hexadecimal digits in text.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct CommandId(pub u128);
+
+impl fmt::Display for CommandId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:032x}", self.0)
+    }
+}
+
+/// Not 32 hexadecimal digits.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("command id {0:?} is not 32 hexadecimal digits")]
+pub struct IdError(String);
+
+impl FromStr for CommandId {
+    type Err = IdError;
+
+    fn from_str(text: &str) -> Result<Self, IdError> {
+        if text.len() == 32 && text.bytes().all(|b| b.is_ascii_hexdigit()) {
+            u128::from_str_radix(text, 16)
+                .map(Self)
+                .map_err(|_| IdError(text.to_owned()))
+        } else {
+            Err(IdError(text.to_owned()))
+        }
+    }
+}
+
+// Digits where people read, 16 bytes where machines do.
+impl Serialize for CommandId {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if serializer.is_human_readable() {
+            serializer.collect_str(self)
+        } else {
+            self.0.to_le_bytes().serialize(serializer)
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for CommandId {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        if deserializer.is_human_readable() {
+            let text = String::deserialize(deserializer)?;
+            text.parse().map_err(serde::de::Error::custom)
+        } else {
+            <[u8; 16]>::deserialize(deserializer).map(|bytes| Self(u128::from_le_bytes(bytes)))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn parse_undoes_format(id: u128) {
+            prop_assert_eq!(CommandId(id).to_string().parse(), Ok(CommandId(id)));
+        }
+    }
+
+    #[test]
+    fn other_text_is_no_id() {
+        for text in ["", "1", "+0000000000000000000000000000001", &"g".repeat(32)] {
+            assert!(text.parse::<CommandId>().is_err(), "{text}");
+        }
+    }
+}

@@ -1,0 +1,7 @@
+//! What the pit wall tells a car to do, and the car's answers.
+
+mod answer;
+mod command;
+
+pub use answer::{Answer, Candidate, Outcome, Reply, StoredSet};
+pub use command::{Action, Command, CommandId, IdError, ParamsAction, Rates, RatesAction, RelocalizeAction};

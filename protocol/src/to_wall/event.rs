@@ -1,0 +1,244 @@
+//! What happened on a car.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Cause, CommandId, Message, Pose2, Schema, Severity, State};
+
+/// Something that happened, at the header's sensor time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Event {
+    /// What.
+    pub kind: EventKind,
+    /// The last filter update before it; 0 before the first.
+    pub update: u64,
+    /// Who caused it: an operator's name, `auto`, or None for the car itself.
+    pub who: Option<String>,
+    /// The command that caused it.
+    pub command: Option<CommandId>,
+}
+
+/// A parameter set by name, at a revision.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SetRef {
+    /// The set's name.
+    pub name: String,
+    /// The revision, see [`Params::revision`](crate::Params::revision).
+    pub revision: u64,
+}
+
+/// The kinds of event.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EventKind {
+    /// The node started.
+    Started {
+        /// Its version.
+        version: String,
+    },
+    /// The node is about to stop.
+    Stopping {
+        /// Why.
+        reason: String,
+    },
+    /// The health state changed.
+    StateChanged {
+        /// Before.
+        from: State,
+        /// Now.
+        to: State,
+        /// Why, the worst first.
+        causes: Vec<Cause>,
+    },
+    /// Another set is in force.
+    ParametersChanged {
+        /// Before.
+        from: SetRef,
+        /// Now.
+        to: SetRef,
+        /// The first filter update under it.
+        update: u64,
+        /// The car falls back by itself after this time unless the set is confirmed [s].
+        revert_after: Option<f32>,
+    },
+    /// The set in force was confirmed: the car will not fall back by itself.
+    ParametersConfirmed {
+        /// The set.
+        set: SetRef,
+    },
+    /// The car fell back by itself, because nobody confirmed.
+    ParametersFellBack {
+        /// Before.
+        from: SetRef,
+        /// Now.
+        to: SetRef,
+        /// The first filter update under it.
+        update: u64,
+    },
+    /// A set was stored on the car.
+    SetStored {
+        /// Its name.
+        name: String,
+    },
+    /// A set was deleted from the car.
+    SetDeleted {
+        /// Its name.
+        name: String,
+    },
+    /// A pose to start from was given.
+    PoseInitialized {
+        /// `map_from_base_link`.
+        pose: Pose2,
+    },
+    /// A search of the whole map began.
+    SearchStarted,
+    /// A search of the whole map ended with a pose.
+    Relocalized {
+        /// `map_from_base_link`.
+        pose: Pose2,
+    },
+    /// The start line was crossed.
+    Lap {
+        /// The lap that ended, from 1.
+        lap: u32,
+        /// Its time; None for the first crossing, which ends no whole lap [s].
+        time: Option<f64>,
+        /// The set in force at its end.
+        set: String,
+    },
+    /// The wheels began to slip.
+    SlipStarted {
+        /// See [`Metrics::slip`](crate::Metrics::slip).
+        slip: f32,
+    },
+    /// The wheels grip again.
+    SlipEnded {
+        /// The worst in between, see [`Metrics::slip`](crate::Metrics::slip).
+        worst: f32,
+        /// How long it lasted [s].
+        duration: f32,
+    },
+    /// The car would rather use another set.
+    Proposed {
+        /// That set.
+        set: String,
+        /// Why.
+        evidence: String,
+    },
+    /// Automatic switching was turned on or off.
+    AutoChanged {
+        /// On.
+        on: bool,
+    },
+    /// The telemetry rates were changed.
+    RatesChanged,
+    /// A command was refused.
+    CommandRefused {
+        /// Every fault.
+        faults: Vec<String>,
+    },
+    /// A bag or a race came to its end.
+    SourceEnded,
+    /// Something is not as it should be; the car goes on.
+    Warning {
+        /// What.
+        text: String,
+    },
+    /// Something failed.
+    Error {
+        /// What.
+        text: String,
+    },
+}
+
+impl EventKind {
+    /// How much it counts.
+    pub fn severity(&self) -> Severity {
+        match self {
+            Self::StateChanged { to, .. } => match to {
+                State::Lost | State::Stale => Severity::Critical,
+                State::Degraded | State::Relocalizing => Severity::Warning,
+                State::Init | State::Converging | State::Localized => Severity::Info,
+            },
+            Self::Error { .. } => Severity::Critical,
+            Self::ParametersFellBack { .. }
+            | Self::SearchStarted
+            | Self::SlipStarted { .. }
+            | Self::Proposed { .. }
+            | Self::CommandRefused { .. }
+            | Self::Stopping { .. }
+            | Self::Warning { .. } => Severity::Warning,
+            _ => Severity::Info,
+        }
+    }
+}
+
+impl fmt::Display for EventKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let set = |set: &SetRef| format!("{} (revision {})", set.name, set.revision);
+        let pose = |p: &Pose2| format!("({:.2}, {:.2}) m, {:.1} deg", p.x, p.y, p.heading.to_degrees());
+        match self {
+            Self::Started { version } => write!(f, "node started, version {version}"),
+            Self::Stopping { reason } => write!(f, "node stops: {reason}"),
+            Self::StateChanged { from, to, causes } => {
+                write!(f, "{from} -> {to}")?;
+                for (i, cause) in causes.iter().enumerate() {
+                    write!(f, "{} {cause}", if i == 0 { ":" } else { ";" })?;
+                }
+                Ok(())
+            }
+            Self::ParametersChanged {
+                from,
+                to,
+                update,
+                revert_after,
+            } => {
+                write!(
+                    f,
+                    "set {} in place of {} from update {update}",
+                    set(to),
+                    set(from)
+                )?;
+                match revert_after {
+                    Some(seconds) => write!(f, "; falls back after {seconds:.0} s unless confirmed"),
+                    None => Ok(()),
+                }
+            }
+            Self::ParametersConfirmed { set: name } => write!(f, "set {} confirmed", set(name)),
+            Self::ParametersFellBack { from, to, update } => {
+                let (from, to) = (set(from), set(to));
+                write!(f, "nobody confirmed {from}: back to {to} from update {update}")
+            }
+            Self::SetStored { name } => write!(f, "set {name} stored"),
+            Self::SetDeleted { name } => write!(f, "set {name} deleted"),
+            Self::PoseInitialized { pose: at } => write!(f, "initial pose {}", pose(at)),
+            Self::SearchStarted => f.write_str("searching the whole map"),
+            Self::Relocalized { pose: at } => write!(f, "relocalized at {}", pose(at)),
+            Self::Lap { lap, time, set } => match time {
+                Some(time) => write!(f, "lap {lap}: {time:.3} s on {set}"),
+                None => write!(f, "start line crossed, on {set}"),
+            },
+            Self::SlipStarted { slip } => write!(f, "wheels slip, {:.0} %", slip * 100.0),
+            Self::SlipEnded { worst, duration } => {
+                write!(
+                    f,
+                    "wheels grip again after {duration:.1} s, worst slip {:.0} %",
+                    worst * 100.0
+                )
+            }
+            Self::Proposed { set, evidence } => write!(f, "proposes {set}: {evidence}"),
+            Self::AutoChanged { on } => {
+                write!(f, "automatic switching {}", if *on { "on" } else { "off" })
+            }
+            Self::RatesChanged => f.write_str("telemetry rates changed"),
+            Self::CommandRefused { faults } => write!(f, "command refused: {}", faults.join("; ")),
+            Self::SourceEnded => f.write_str("end of the sensor data"),
+            Self::Warning { text } | Self::Error { text } => f.write_str(text),
+        }
+    }
+}
+
+impl Message for Event {
+    const SCHEMA: Schema = Schema::Event;
+}

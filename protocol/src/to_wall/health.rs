@@ -1,0 +1,286 @@
+//! How well the car is localized, and why.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Invalid, Message, Schema};
+
+/// The state with its causes, and every number behind it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Health {
+    /// The state.
+    pub state: State,
+    /// When this state was entered [unix ns].
+    pub since: i64,
+    /// Why: the worst first; empty when all is well. At most [`Health::MAX_CAUSES`].
+    pub causes: Vec<Cause>,
+    /// The last filter update; 0 before the first.
+    pub update: u64,
+    /// What was measured at that update; None before the first.
+    pub metrics: Option<Metrics>,
+    /// The set that the car would rather use, while that is not the one in force.
+    pub proposal: Option<Proposal>,
+    /// True while the car switches sets by itself.
+    pub auto: bool,
+}
+
+impl Health {
+    /// Most causes in one message.
+    pub const MAX_CAUSES: usize = 32;
+}
+
+/// What the car knows of its own pose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// No pose yet.
+    Init,
+    /// A pose, not yet confirmed.
+    Converging,
+    /// The pose can be raced on.
+    Localized,
+    /// The pose is probably right; something is wrong.
+    Degraded,
+    /// The pose is wrong.
+    Lost,
+    /// Searching the whole map.
+    Relocalizing,
+    /// No sensor data.
+    Stale,
+}
+
+impl fmt::Display for State {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Self::Init => "INIT",
+            Self::Converging => "CONVERGING",
+            Self::Localized => "LOCALIZED",
+            Self::Degraded => "DEGRADED",
+            Self::Lost => "LOST",
+            Self::Relocalizing => "RELOCALIZING",
+            Self::Stale => "STALE",
+        })
+    }
+}
+
+/// One reason for a state.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Cause {
+    /// What is wrong.
+    pub kind: CauseKind,
+    /// How much it counts.
+    pub severity: Severity,
+    /// The value measured, in the unit of the metric.
+    pub value: Option<f32>,
+    /// The threshold that it crossed.
+    pub limit: Option<f32>,
+}
+
+/// What can be wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CauseKind {
+    /// Nobody has given a pose to start from.
+    NoInitialPose,
+    /// A new pose was given or found and is not yet confirmed by motion.
+    NewPose,
+    /// Too few end points lie on walls.
+    Alignment,
+    /// End points lie far from walls.
+    Residual,
+    /// Beams are longer than the map says.
+    LongBeams,
+    /// Beams are shorter than the map says: something stands in view.
+    Occluded,
+    /// Many beams come back with nothing.
+    NoReturn,
+    /// Few particles carry the weight.
+    EffectiveSampleSize,
+    /// Scans fit worse than they used to.
+    Likelihood,
+    /// Unsure along the track.
+    SpreadAlong,
+    /// Unsure across the track.
+    SpreadAcross,
+    /// A second place fits nearly as well.
+    SecondMode,
+    /// The wheels spin or lock.
+    Slip,
+    /// Odometry's yaw rate is wrong.
+    YawRate,
+    /// A scan moved the pose far.
+    Innovation,
+    /// Poses come late.
+    Age,
+    /// No scans come in.
+    NoScan,
+    /// No odometry comes in.
+    NoOdometry,
+    /// Sensor data comes in and is refused.
+    BadSensorData,
+    /// A search of the whole map is under way.
+    Searching,
+}
+
+impl CauseKind {
+    /// In words, without the numbers.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::NoInitialPose => "no initial pose",
+            Self::NewPose => "new pose, not yet confirmed by motion",
+            Self::Alignment => "scan off the walls: alignment",
+            Self::Residual => "scan off the walls: residual",
+            Self::LongBeams => "beams through walls",
+            Self::Occluded => "view blocked by opponents",
+            Self::NoReturn => "beams without return",
+            Self::EffectiveSampleSize => "few effective particles",
+            Self::Likelihood => "scans fit worse than usual",
+            Self::SpreadAlong => "unsure along the track",
+            Self::SpreadAcross => "unsure across the track",
+            Self::SecondMode => "a second place fits",
+            Self::Slip => "wheels slip",
+            Self::YawRate => "odometry's yaw rate is off",
+            Self::Innovation => "pose corrected by a jump",
+            Self::Age => "poses late",
+            Self::NoScan => "no scans",
+            Self::NoOdometry => "no odometry",
+            Self::BadSensorData => "bad sensor data",
+            Self::Searching => "searching the map",
+        }
+    }
+
+    /// The unit of its value.
+    pub fn unit(self) -> &'static str {
+        match self {
+            Self::Residual | Self::SpreadAlong | Self::SpreadAcross | Self::Innovation => "m",
+            Self::YawRate => "rad/s",
+            Self::Age | Self::NoScan | Self::NoOdometry => "s",
+            _ => "",
+        }
+    }
+}
+
+impl fmt::Display for Cause {
+    /// `scan off the walls: alignment 0.41 (limit 0.45)`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.kind.words())?;
+        let unit = self.kind.unit();
+        let space = if unit.is_empty() { "" } else { " " };
+        if let Some(value) = self.value {
+            write!(f, " {value:.2}{space}{unit}")?;
+        }
+        if let Some(limit) = self.limit {
+            write!(f, " (limit {limit:.2}{space}{unit})")?;
+        }
+        Ok(())
+    }
+}
+
+/// How much something counts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Good to know.
+    Info,
+    /// Keep an eye on it.
+    Warning,
+    /// Act now.
+    Critical,
+}
+
+/// What was measured at an update.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Metrics {
+    /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in `[0, 1]`.
+    pub alignment: f32,
+    /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
+    pub residual: f32,
+    /// Share of the valid beams more than 0.3 m shorter than the map says, in `[0, 1]`.
+    pub short_beams: f32,
+    /// Share of the valid beams more than 0.3 m longer than the map says, in `[0, 1]`.
+    pub long_beams: f32,
+    /// Share of the beams without a return, in `[0, 1]`.
+    pub no_return: f32,
+    /// Effective sample size over the number of particles, before resampling, in `[0, 1]`.
+    pub ess_ratio: f32,
+    /// `w_fast / w_slow` of augmented Monte-Carlo localization; 1 when all is as usual.
+    pub w_ratio: f32,
+    /// Standard deviation of the particles along the track [m].
+    pub spread_along: f32,
+    /// Standard deviation of the particles across the track [m].
+    pub spread_across: f32,
+    /// Mass of the second cluster of particles over that of the first, in `[0, 1]`.
+    pub second_mode: f32,
+    /// Slip: share of odometry's distance that was not driven; positive when the wheels spin.
+    pub slip: f32,
+    /// Odometry's yaw rate less the posterior's [rad/s].
+    pub yaw_rate_residual: f32,
+    /// Distance by which the last scan corrected the pose [m].
+    pub innovation: f32,
+    /// Angle by which the last scan corrected the pose [rad].
+    pub innovation_angle: f32,
+    /// Age of a pose when it was published: median over the last second [s].
+    pub age_p50: f32,
+    /// Age of a pose when it was published: 99th percentile over the last second [s].
+    pub age_p99: f32,
+    /// Particles in use.
+    pub particles: u32,
+}
+
+/// A set that the car would rather use.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Proposal {
+    /// The set's name.
+    pub set: String,
+    /// Why, in words with numbers.
+    pub evidence: String,
+    /// Since when [unix ns].
+    pub since: i64,
+}
+
+impl Message for Health {
+    const SCHEMA: Schema = Schema::Health;
+    const MAX_LEN: usize = 4096;
+
+    fn validate(&self) -> Result<(), Invalid> {
+        Invalid::unless_at_most("causes", self.causes.len(), Self::MAX_CAUSES)?;
+        if let Some(m) = &self.metrics {
+            for (field, share) in [
+                ("alignment", m.alignment),
+                ("short_beams", m.short_beams),
+                ("long_beams", m.long_beams),
+                ("no_return", m.no_return),
+                ("ess_ratio", m.ess_ratio),
+                ("second_mode", m.second_mode),
+            ] {
+                Invalid::unless_share(field, share)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_reads_as_a_sentence() {
+        let cause = |kind, value, limit| {
+            let severity = Severity::Warning;
+            Cause {
+                kind,
+                severity,
+                value,
+                limit,
+            }
+            .to_string()
+        };
+        assert_eq!(
+            cause(CauseKind::SpreadAlong, Some(0.52), Some(0.4)),
+            "unsure along the track 0.52 m (limit 0.40 m)"
+        );
+        assert_eq!(cause(CauseKind::NoInitialPose, None, None), "no initial pose");
+    }
+}

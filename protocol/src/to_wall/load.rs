@@ -1,0 +1,112 @@
+//! What the localizer costs the car, and how its data flows.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Invalid, Message, Schema};
+
+/// Load over the last second.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Load {
+    /// CPU of this process; 1 is one core.
+    pub cpu_process: f32,
+    /// Use of each core, in `[0, 1]`. At most [`Load::MAX_CORES`].
+    pub cpu_cores: Vec<f32>,
+    /// Memory of this process [bytes].
+    pub memory_process: u64,
+    /// Memory in use on the machine [bytes].
+    pub memory_used: u64,
+    /// Memory of the machine [bytes].
+    pub memory_total: u64,
+    /// The hottest sensor of the machine [deg C]; None where it does not tell.
+    pub temperature: Option<f32>,
+    /// True while the machine slows down for heat or lack of power; None where it does not tell.
+    pub throttled: Option<bool>,
+    /// Time of a whole filter update, scan in to estimate out [us].
+    pub update_us: Latency,
+    /// Age of a scan when it reached the filter [us].
+    pub scan_age_us: Latency,
+    /// From a pose leaving the filter to the network having taken it [us].
+    pub publish_lag_us: Latency,
+    /// Scans per second.
+    pub scan_rate: f32,
+    /// Odometry messages per second.
+    pub odometry_rate: f32,
+    /// Filter updates per second.
+    pub update_rate: f32,
+    /// Standard deviation of the time between scans [s].
+    pub scan_jitter: f32,
+    /// Messages waiting for the filter.
+    pub queue_depth: u32,
+    /// What was dropped since the node started.
+    pub drops: Drops,
+}
+
+impl Load {
+    /// Most cores in one message.
+    pub const MAX_CORES: usize = 256;
+}
+
+/// Spread of a duration [us].
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Latency {
+    /// Median [us].
+    pub p50: f32,
+    /// 99th percentile [us].
+    pub p99: f32,
+    /// Maximum [us].
+    pub max: f32,
+}
+
+/// Messages dropped since the node started, by cause.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Drops {
+    /// Sensor messages with NaN, infinities or a geometry that makes no sense.
+    pub malformed: u64,
+    /// Sensor messages not later than the last one of their kind.
+    pub time_backwards: u64,
+    /// Scans before the first odometry.
+    pub no_odometry: u64,
+    /// Scans too long after the last odometry.
+    pub stale_odometry: u64,
+    /// Scans without a usable beam.
+    pub no_beams: u64,
+    /// Scans before the first pose.
+    pub not_initialized: u64,
+    /// Sensor messages that the filter was too slow for.
+    pub overrun: u64,
+    /// Telemetry that the publisher was too slow for.
+    pub telemetry: u64,
+    /// Payloads from the network that could not be read.
+    pub payloads: u64,
+}
+
+impl Drops {
+    /// All of them.
+    pub fn total(&self) -> u64 {
+        self.named().into_iter().map(|(_, count)| count).sum()
+    }
+
+    /// Each with its name.
+    pub fn named(&self) -> [(&'static str, u64); 9] {
+        [
+            ("malformed", self.malformed),
+            ("time backwards", self.time_backwards),
+            ("no odometry", self.no_odometry),
+            ("stale odometry", self.stale_odometry),
+            ("no beams", self.no_beams),
+            ("not initialized", self.not_initialized),
+            ("overrun", self.overrun),
+            ("telemetry", self.telemetry),
+            ("payloads", self.payloads),
+        ]
+    }
+}
+
+impl Message for Load {
+    const SCHEMA: Schema = Schema::Load;
+    const MAX_LEN: usize = 4096;
+
+    fn validate(&self) -> Result<(), Invalid> {
+        Invalid::unless_at_most("cpu_cores", self.cpu_cores.len(), Self::MAX_CORES)
+    }
+}

@@ -1,0 +1,24 @@
+//! What a car says of itself, and its answers to questions.
+
+mod cloud;
+mod event;
+mod health;
+mod info;
+mod load;
+mod map;
+mod params;
+mod pose;
+mod recorded;
+mod scan_view;
+
+pub use cloud::{Cloud, CloudParticle};
+pub use event::{Event, EventKind, SetRef};
+pub use health::{Cause, CauseKind, Health, Metrics, Proposal, Severity, State};
+pub use info::{CarInfo, ClockReply, ClockRequest};
+pub use load::{Drops, Latency, Load};
+pub use map::{Cell, MapRaceline, MapReply};
+pub(crate) use params::set_name;
+pub use params::{ParameterSet, Params, PendingRevert, Value};
+pub use pose::{Pose, PoseKind, TrackPoint};
+pub use recorded::{RecordedOdometry, RecordedScan, Truth};
+pub use scan_view::{EndPoint, EndPointKind, ScanView};

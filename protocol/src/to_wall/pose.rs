@@ -1,0 +1,48 @@
+//! Where the car is.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Covariance, Message, Pose2, Schema, Twist2};
+
+/// The pose of `base_link` in `map`, true at the header's sensor time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Pose {
+    /// `map_from_base_link`.
+    pub pose: Pose2,
+    /// Velocity at that time.
+    pub twist: Twist2,
+    /// Uncertainty of the pose, in `map`.
+    pub covariance: Covariance,
+    /// Where on the raceline; None where the car has none.
+    pub track: Option<TrackPoint>,
+    /// Laps begun since the node started; 0 before the start line was crossed for the first time.
+    pub lap: u32,
+    /// The filter update that this pose comes from; counts from 1.
+    pub update: u64,
+    /// How it came about.
+    pub kind: PoseKind,
+}
+
+/// A place relative to a raceline.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TrackPoint {
+    /// Arc length of the nearest point of the line [m].
+    pub s: f64,
+    /// Signed distance from the line, left positive [m].
+    pub d: f64,
+}
+
+/// How a pose came about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseKind {
+    /// The posterior of a scan.
+    Updated,
+    /// The last posterior, carried forward by the odometry since.
+    Predicted,
+}
+
+impl Message for Pose {
+    const SCHEMA: Schema = Schema::Pose;
+    const MAX_LEN: usize = 1024;
+}

@@ -1,0 +1,112 @@
+//! The bytes on the wire, one message of each kind. A failure here means that a message's layout has changed: give
+//! it a new version, do not mend the bytes.
+
+use protocol::*;
+
+use crate::samples;
+
+const STAMPS: Stamps = Stamps {
+    session: 1,
+    sequence: 2,
+    sensor: 3,
+    published: 4,
+};
+
+/// The payload of a message in hexadecimal digits.
+fn payload(message: &impl Message) -> String {
+    let bytes = encode(message, STAMPS).expect("a good message");
+    hex(&bytes[Header::LEN..])
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes
+        .iter()
+        .fold(String::new(), |digits, b| digits + &format!("{b:02x}"))
+}
+
+#[test]
+fn header() {
+    let bytes = encode(&ClockRequest { sent: 5 }, STAMPS).expect("a good message");
+    assert_eq!(
+        hex(&bytes),
+        concat!(
+            "53595046",
+            "0d00",
+            "0100",
+            "0100000000000000",
+            "0200000000000000",
+            "0300000000000000",
+            "0400000000000000",
+            "0500000000000000",
+        )
+    );
+}
+
+#[test]
+fn schemas_keep_their_numbers() {
+    let ids: Vec<_> = Schema::ALL.iter().map(|&schema| schema as u16).collect();
+    assert_eq!(ids, (1..=16).collect::<Vec<_>>());
+    assert_eq!(Schema::from_id(7), Some(Schema::Event));
+    assert_eq!(Schema::from_id(0), None);
+}
+
+#[test]
+fn variants_keep_their_numbers() {
+    fn tags<M: Message>(messages: impl IntoIterator<Item = M>, at: usize) -> Vec<u32> {
+        let tag = |message: M| {
+            let bytes = encode(&message, STAMPS).expect("a good message");
+            let tag = bytes[Header::LEN + at..].first_chunk().expect("a tag");
+            u32::from_le_bytes(*tag)
+        };
+        messages.into_iter().map(tag).collect()
+    }
+    let count = |n: u32| (0..n).collect::<Vec<_>>();
+    assert_eq!(tags(samples::STATES.map(samples::health), 0), count(7));
+    assert_eq!(
+        tags(samples::event_kinds().into_iter().map(samples::event), 0),
+        count(21)
+    );
+    // A command: id 16, operator 8 + 3, revision 1 + 8.
+    let commands = || samples::actions().into_iter().map(samples::command);
+    assert_eq!(tags(commands(), 36), [0, 0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4]);
+    assert_eq!(tags(commands().take(6), 40), count(6));
+    // An answer: id 16, the outcome, and for Done the update 1 + 8.
+    let answers = || samples::outcomes().into_iter().map(samples::answer);
+    assert_eq!(tags(answers(), 16), [0, 0, 0, 0, 1, 2]);
+    assert_eq!(tags(answers().take(4), 29), count(4));
+}
+
+/// The payload that `golden.txt` has under `name`.
+fn golden(name: &str) -> &'static str {
+    include_str!("golden.txt")
+        .lines()
+        .find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
+        .unwrap_or("missing in golden.txt")
+}
+
+macro_rules! payloads {
+    ($($name:ident: $message:expr;)*) => {
+        $(#[test]
+        fn $name() {
+            assert_eq!(payload(&$message), golden(stringify!($name)));
+        })*
+    };
+}
+
+payloads! {
+    pose: samples::pose();
+    cloud: samples::cloud();
+    scan_view: samples::scan_view();
+    health: samples::health(State::Degraded);
+    load: samples::load();
+    params: samples::params();
+    event: samples::event(EventKind::SlipStarted { slip: 0.25 });
+    odometry: RecordedOdometry { pose: samples::POSE, twist: samples::TWIST };
+    scan: samples::recorded_scan();
+    truth: Truth { pose: samples::POSE, twist: samples::TWIST };
+    map: samples::map();
+    info: samples::info();
+    clock_reply: ClockReply { sent: 1, received: 2, answered: 3 };
+    command: samples::command(samples::actions().swap_remove(1));
+    answer: samples::answer(samples::outcomes().swap_remove(1));
+}

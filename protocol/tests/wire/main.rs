@@ -1,0 +1,5 @@
+//! The wire format: round trips, refusals, and the bytes themselves.
+
+mod golden;
+mod round_trip;
+mod samples;

@@ -1,0 +1,302 @@
+//! `car-node evaluate`.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use car_node::bag::{Bag, SensorLog, Topics};
+use car_node::evaluate::{ErrorSummary, Outcome, Start, Truth, run as run_over};
+use car_node::frames::Mount;
+use car_node::sets::{self, NamedSet};
+use indicatif::{ProgressBar, ProgressStyle};
+use maps::OccupancyGrid;
+use serde::Serialize;
+use synpf::{Localizer, TrackMap, Update};
+
+use crate::cli::Evaluate;
+
+/// The range table of the map, as reported.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct RangeTable {
+    /// Time to make the map ready [ms].
+    build_ms: f64,
+    /// Memory that it takes.
+    bytes: usize,
+}
+
+/// One bag under one seed, as reported.
+#[derive(Debug, Serialize)]
+struct Report {
+    bag: PathBuf,
+    params: String,
+    seed: u64,
+    #[serde(flatten)]
+    outcome: Outcome,
+    range_table: RangeTable,
+}
+
+pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
+    if arguments.poses.is_some() && arguments.bag.len() * arguments.seed.len() > 1 {
+        bail!("--poses takes the poses of one run: give one --bag and one --seed");
+    }
+    let set = sets::load(&arguments.params)?;
+    if !set.unknown_keys.is_empty() {
+        eprintln!(
+            "car-node: warning: {}: keys that mean nothing here: {}",
+            arguments.params,
+            set.unknown_keys.join(", ")
+        );
+    }
+    let grid = OccupancyGrid::load(&arguments.map)?;
+    let before = Instant::now();
+    let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
+    let range_table = RangeTable {
+        build_ms: before.elapsed().as_secs_f64() * 1e3,
+        bytes: map.table_bytes(),
+    };
+
+    let mut reports = Vec::new();
+    for bag in &arguments.bag {
+        let log = read(bag, arguments)?;
+        let truth = Truth::new(log.truth.clone());
+        for &seed in &arguments.seed {
+            let outcome = over_bag(arguments, &map, &set, bag, &log, &truth, seed)
+                .with_context(|| bag.display().to_string())?;
+            reports.push(Report {
+                bag: bag.clone(),
+                params: set.name.clone(),
+                seed,
+                outcome,
+                range_table,
+            });
+        }
+    }
+
+    match &reports[..] {
+        [report] if arguments.json => println!("{}", serde_json::to_string_pretty(report)?),
+        reports if arguments.json => println!("{}", serde_json::to_string_pretty(reports)?),
+        [report] => print_one(report),
+        reports => print_table(reports),
+    }
+    Ok(())
+}
+
+fn read(bag: &Path, arguments: &Evaluate) -> anyhow::Result<SensorLog> {
+    let topics = Topics {
+        scan: arguments.scan_topic.clone(),
+        odometry: arguments.odom_topic.clone(),
+        truth: arguments.truth_topic.clone(),
+        imu: arguments.imu_topic.clone(),
+    };
+    Ok(Bag::read(bag)?.sensors(&topics, arguments.laser.map(Mount::upright))?)
+}
+
+fn over_bag(
+    arguments: &Evaluate,
+    map: &Arc<TrackMap>,
+    set: &NamedSet,
+    bag: &Path,
+    log: &SensorLog,
+    truth: &Truth,
+    seed: u64,
+) -> anyhow::Result<Outcome> {
+    let mount = log.mount.unwrap_or_else(|| {
+        let typical = Mount::typical();
+        eprintln!(
+            "car-node: warning: {}: no /tf_static; laser assumed {} m ahead of base_link (--laser says otherwise)",
+            bag.display(),
+            typical.base_link_from_laser.x
+        );
+        typical
+    });
+    let mut localizer = Localizer::new(
+        Arc::clone(map),
+        mount.base_link_from_laser,
+        set.parameters.clone(),
+        seed,
+    )?;
+    let mut poses = arguments.poses.as_deref().map(PoseFile::create).transpose()?;
+    let mut failed = None;
+    let progress = progress_bar(bag, seed);
+    let start = arguments.initial_pose.unwrap_or(Start::Global);
+    let outcome = run_over(&mut localizer, &log.arrivals, truth, start, |update, done| {
+        if update.number.is_multiple_of(64) {
+            progress.set_position((done * 1000.0) as u64);
+        }
+        if let Some(poses) = &mut poses
+            && let Err(error) = poses.write(update)
+        {
+            failed.get_or_insert(error);
+        }
+    });
+    progress.finish_and_clear();
+    if let Some(mut poses) = poses {
+        failed
+            .map_or_else(|| poses.file.flush(), Err)
+            .with_context(|| poses.path.display().to_string())?;
+    }
+    Ok(outcome?)
+}
+
+fn progress_bar(bag: &Path, seed: u64) -> ProgressBar {
+    // Drawn on stderr, and only when that is a terminal.
+    let bar = ProgressBar::new(1000);
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {percent}%") {
+        bar.set_style(style);
+    }
+    bar.enable_steady_tick(Duration::from_millis(250));
+    bar.set_message(format!("{} seed {seed}", bag.display()));
+    bar
+}
+
+/// The CSV file of `--poses`.
+struct PoseFile {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl PoseFile {
+    fn create(path: &Path) -> anyhow::Result<Self> {
+        let file = File::create(path).with_context(|| path.display().to_string())?;
+        let mut file = BufWriter::new(file);
+        writeln!(file, "stamp_s,x_m,y_m,heading_rad").with_context(|| path.display().to_string())?;
+        Ok(Self {
+            path: path.into(),
+            file,
+        })
+    }
+
+    fn write(&mut self, update: &Update) -> std::io::Result<()> {
+        let (seconds, nanoseconds) = (
+            update.stamp.0.div_euclid(1_000_000_000),
+            update.stamp.0.rem_euclid(1_000_000_000),
+        );
+        let pose = update.pose;
+        writeln!(
+            self.file,
+            "{seconds}.{nanoseconds:09},{:.6},{:.6},{:.6}",
+            pose.x, pose.y, pose.heading
+        )
+    }
+}
+
+/// One run, line by line.
+fn print_one(report: &Report) {
+    let Report {
+        outcome, range_table, ..
+    } = report;
+    println!(
+        "{}  set {}, seed {}",
+        report.bag.display(),
+        report.params,
+        report.seed
+    );
+    println!("  scans        {:>9}", outcome.scans);
+    println!("  updates      {:>9}", outcome.updates);
+    for (cause, count) in &outcome.dropped {
+        println!("  dropped      {count:>9}  {cause}");
+    }
+    match &outcome.errors {
+        Some(errors) => {
+            println!("  error             mean      rmse       p95       max");
+            let line = |name: &str, unit: &str, scale: f64, of: &ErrorSummary| {
+                println!(
+                    "  {name:<12} {:>9.2} {:>9.2} {:>9.2} {:>9.2}  {unit}",
+                    of.mean * scale,
+                    of.rmse * scale,
+                    of.p95 * scale,
+                    of.max * scale
+                );
+            };
+            line("position", "cm", 100.0, &errors.position_error_m);
+            line("lateral", "cm", 100.0, &errors.lateral_error_m);
+            line("longitudinal", "cm", 100.0, &errors.longitudinal_error_m);
+            line("heading", "deg", 1_f64.to_degrees(), &errors.heading_error_rad);
+            println!("  excursions   {:>9}", errors.excursions);
+        }
+        None => println!("  error        no truth to compare with"),
+    }
+    if let Some(alignment) = outcome.alignment {
+        println!(
+            "  alignment    {:>9.3}  mean, {:.3} p05",
+            alignment.mean, alignment.p05
+        );
+    }
+    if let Some(times) = outcome.update_us {
+        println!(
+            "  update       {:>9.0}  us p50, {:.0} p99, {:.0} max",
+            times.p50, times.p99, times.max
+        );
+    }
+    if let Some(particles) = outcome.particles {
+        println!("  particles    {:>9.0}", particles.mean);
+    }
+    println!(
+        "  range table  {:>9.0}  ms, {:.1} MB",
+        range_table.build_ms,
+        range_table.bytes as f64 / 1e6
+    );
+}
+
+/// Several runs, a row each.
+fn print_table(reports: &[Report]) {
+    println!(
+        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+        "bag",
+        "seed",
+        "updates",
+        "dropped",
+        "pos rmse",
+        "lat rmse",
+        "lon rmse",
+        "hdg rmse",
+        "excurs",
+        "align",
+        "al p05",
+        "us p50",
+        "us p99"
+    );
+    println!(
+        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8}",
+        "", "", "", "", "cm", "cm", "cm", "deg"
+    );
+    let mut previous = None;
+    for report in reports {
+        let outcome = &report.outcome;
+        let or_dash =
+            |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
+        let rmse = |of: fn(&car_node::evaluate::Summaries) -> ErrorSummary, scale: f64| {
+            or_dash(outcome.errors.as_ref().map(|errors| of(errors).rmse * scale), 2)
+        };
+        let name = if previous == Some(&report.bag) {
+            String::new()
+        } else {
+            short_name(&report.bag)
+        };
+        previous = Some(&report.bag);
+        println!(
+            "{name:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+            report.seed,
+            outcome.updates,
+            outcome.dropped.values().sum::<usize>(),
+            rmse(|errors| errors.position_error_m, 100.0),
+            rmse(|errors| errors.lateral_error_m, 100.0),
+            rmse(|errors| errors.longitudinal_error_m, 100.0),
+            rmse(|errors| errors.heading_error_rad, 1_f64.to_degrees()),
+            or_dash(outcome.errors.as_ref().map(|errors| errors.excursions as f64), 0),
+            or_dash(outcome.alignment.map(|alignment| alignment.mean), 3),
+            or_dash(outcome.alignment.map(|alignment| alignment.p05), 3),
+            or_dash(outcome.update_us.map(|times| times.p50), 0),
+            or_dash(outcome.update_us.map(|times| times.p99), 0),
+        );
+    }
+}
+
+/// The file with the folder that it is in: `jfr5/hq.mcap`.
+fn short_name(path: &Path) -> String {
+    let components: Vec<_> = path.iter().map(|part| part.to_string_lossy()).collect();
+    components[components.len().saturating_sub(2)..].join("/")
+}

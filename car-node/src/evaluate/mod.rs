@@ -1,0 +1,169 @@
+//! A filter over a whole log, as fast as it goes, held against the truth. Same inputs, same numbers (but for
+//! the times taken).
+
+mod errors;
+mod statistics;
+mod truth;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use maps::Pose;
+use serde::Serialize;
+use synpf::{Dropped, Localizer, SetUpError, Stamp, Update};
+
+pub use errors::{PoseErrors, Summaries};
+pub use statistics::{ErrorSummary, mean, percentile};
+pub use truth::Truth;
+
+use crate::bag::{Arrival, SensorEvent};
+
+/// Where a run starts from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Start {
+    /// From this `map_from_base_link`, true when the first scan arrives.
+    Pose(Pose),
+    /// From the true pose when the first scan arrives.
+    Truth,
+    /// From nothing: the localizer searches the map.
+    Global,
+}
+
+/// Mean and low end of a share.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct AlignmentSummary {
+    /// Mean over all updates.
+    pub mean: f64,
+    /// The value that 95 % of the updates exceed.
+    pub p05: f64,
+}
+
+/// Times taken by whole updates [us].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct UpdateTimes {
+    /// Median.
+    pub p50: f64,
+    /// 99 of 100 are faster.
+    pub p99: f64,
+    /// The slowest.
+    pub max: f64,
+}
+
+/// Particles in use.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ParticleSummary {
+    /// Mean over all updates.
+    pub mean: f64,
+}
+
+/// What one run gave.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Outcome {
+    /// Scans in the log.
+    pub scans: usize,
+    /// Scans that led to a pose.
+    pub updates: usize,
+    /// Messages that did not count, by cause.
+    pub dropped: BTreeMap<Dropped, usize>,
+    /// Errors against the truth, where there is any.
+    #[serde(flatten)]
+    pub errors: Option<Summaries>,
+    /// Scan alignment; None without an update.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alignment: Option<AlignmentSummary>,
+    /// Time of a whole update, scan in to estimate out; None without an update.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub update_us: Option<UpdateTimes>,
+    /// Particles; None without an update.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub particles: Option<ParticleSummary>,
+}
+
+/// Why a run cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluateError {
+    /// There is no truth to start from.
+    #[error("the true pose at the first scan is not in the bag; give --initial-pose x,y,heading")]
+    NoTruth,
+    /// The pose to start from is refused.
+    #[error(transparent)]
+    Start(#[from] SetUpError),
+}
+
+/// Runs `localizer` over `arrivals`. `observe` sees every update and the share of the log done so far.
+pub fn run(
+    localizer: &mut Localizer,
+    arrivals: &[Arrival],
+    truth: &Truth,
+    start: Start,
+    mut observe: impl FnMut(&Update, f64),
+) -> Result<Outcome, EvaluateError> {
+    let mut dropped = BTreeMap::new();
+    let mut errors = PoseErrors::default();
+    let (mut alignment, mut times_us, mut particles) = (Vec::new(), Vec::new(), Vec::new());
+    let mut scans = 0;
+    let mut latest_odometry = None;
+
+    for (index, arrival) in arrivals.iter().enumerate() {
+        let result = match &arrival.event {
+            SensorEvent::Odometry(odometry) => {
+                latest_odometry = Some(odometry.stamp);
+                localizer.on_odometry(odometry)
+            }
+            SensorEvent::YawRate(yaw_rate) => localizer.on_yaw_rate(yaw_rate),
+            SensorEvent::Scan(scan) => {
+                if scans == 0 {
+                    begin(localizer, truth, start, latest_odometry.unwrap_or(scan.stamp))?;
+                }
+                scans += 1;
+                let before = Instant::now();
+                let result = localizer.on_scan(scan);
+                let taken = before.elapsed();
+                result.map(|update| {
+                    errors.push(update.stamp, update.pose, truth.at(update.stamp));
+                    alignment.push(update.alignment);
+                    times_us.push(microseconds(taken));
+                    particles.push(update.particles as f64);
+                    observe(&update, (index + 1) as f64 / arrivals.len() as f64);
+                })
+            }
+        };
+        if let Err(cause) = result {
+            *dropped.entry(cause).or_default() += 1;
+        }
+    }
+
+    Ok(Outcome {
+        scans,
+        updates: times_us.len(),
+        dropped,
+        errors: (!truth.is_empty()).then(|| errors.summaries()).flatten(),
+        alignment: mean(&alignment)
+            .zip(percentile(&alignment, 0.05))
+            .map(|(mean, p05)| AlignmentSummary { mean, p05 }),
+        update_us: update_times(&times_us),
+        particles: mean(&particles).map(|mean| ParticleSummary { mean }),
+    })
+}
+
+/// Gives the localizer its start; `now` is the latest odometry's stamp.
+fn begin(localizer: &mut Localizer, truth: &Truth, start: Start, now: Stamp) -> Result<(), EvaluateError> {
+    match start {
+        Start::Pose(pose) => localizer.initialize(pose)?,
+        Start::Truth => localizer.initialize(truth.at(now).ok_or(EvaluateError::NoTruth)?)?,
+        Start::Global => localizer.relocalize(),
+    }
+    Ok(())
+}
+
+fn update_times(times_us: &[f64]) -> Option<UpdateTimes> {
+    Some(UpdateTimes {
+        p50: percentile(times_us, 0.5)?,
+        p99: percentile(times_us, 0.99)?,
+        max: percentile(times_us, 1.0)?,
+    })
+}
+
+fn microseconds(duration: Duration) -> f64 {
+    duration.as_secs_f64() * 1e6
+}

@@ -1,0 +1,89 @@
+//! Parameter sets by name or from a file.
+
+use std::path::{Path, PathBuf};
+
+use synpf::{ParameterFault, Parameters};
+
+/// A set as it was found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NamedSet {
+    /// The set's name: the shipped one's, or the file's without its extension.
+    pub name: String,
+    /// The values.
+    pub parameters: Parameters,
+    /// Keys in the file that mean nothing to this filter.
+    pub unknown_keys: Vec<String>,
+}
+
+/// Why a set cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum SetError {
+    /// Neither a shipped set nor a file.
+    #[error("no parameter set {0:?}: neither a file nor one of {names}", names = Parameters::NAMES.join(", "))]
+    Unknown(String),
+    /// The file does not read.
+    #[error("{path}: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file's values are refused, all of the faults.
+    #[error("{path}: {}", .faults.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
+    Faults {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        faults: Vec<ParameterFault>,
+    },
+}
+
+/// The shipped set of that name, or else the YAML file at that path.
+pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
+    if let Some(parameters) = Parameters::named(name_or_path) {
+        return Ok(NamedSet {
+            name: name_or_path.into(),
+            parameters,
+            unknown_keys: Vec::new(),
+        });
+    }
+    let path = Path::new(name_or_path);
+    if !path.exists() {
+        return Err(SetError::Unknown(name_or_path.into()));
+    }
+    let text = std::fs::read_to_string(path).map_err(|source| SetError::Read {
+        path: path.into(),
+        source,
+    })?;
+    let faulty = |faults| SetError::Faults {
+        path: path.into(),
+        faults,
+    };
+    let (parameters, unknown_keys) = Parameters::from_yaml(&text).map_err(faulty)?;
+    parameters.validate().map_err(faulty)?;
+    Ok(NamedSet {
+        name: path
+            .file_stem()
+            .map_or_else(|| name_or_path.into(), |stem| stem.to_string_lossy().into_owned()),
+        parameters,
+        unknown_keys,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shipped_sets_are_found_by_name_and_others_named_in_the_error() {
+        for name in Parameters::NAMES {
+            assert_eq!(load(name).expect("ships").name, name);
+        }
+        let message = load("no-such-set").expect_err("does not exist").to_string();
+        assert!(
+            message.contains("no-such-set") && message.contains("hq"),
+            "{message}"
+        );
+    }
+}

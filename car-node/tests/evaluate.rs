@@ -1,0 +1,267 @@
+//! `car-node evaluate` as a user calls it, on a bag and a map written here.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use car_node::ros::{
+    self, Header, LaserScan, Orientation, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
+};
+use maps::Pose;
+use serde::Serialize;
+use synpf::Stamp;
+
+/// A room of 8 m x 4 m with walls one cell thick, and a recess that tells one end from the other.
+const WIDTH: usize = 160;
+const HEIGHT: usize = 80;
+const RESOLUTION: f64 = 0.05;
+
+fn occupied(column: usize, row: usize) -> bool {
+    let border = column == 0 || row == 0 || column == WIDTH - 1 || row == HEIGHT - 1;
+    border || (column > 110 && row > 60)
+}
+
+fn write_map(folder: &Path) -> PathBuf {
+    let mut pgm = format!("P5\n{WIDTH} {HEIGHT}\n255\n").into_bytes();
+    for row in (0..HEIGHT).rev() {
+        pgm.extend((0..WIDTH).map(|column| if occupied(column, row) { 0 } else { 255 }));
+    }
+    fs::write(folder.join("map.pgm"), pgm).expect("writes");
+    let yaml = format!(
+        "image: map.pgm\nresolution: {RESOLUTION}\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\n\
+         free_thresh: 0.196\n"
+    );
+    let path = folder.join("map.yaml");
+    fs::write(&path, yaml).expect("writes");
+    path
+}
+
+/// Range by stepping 2 mm at a time: independent of the ray casting under test.
+fn range(laser: Pose, angle: f64) -> f32 {
+    let (sin, cos) = (laser.heading + angle).sin_cos();
+    let mut distance = 0.0;
+    loop {
+        let (x, y) = (laser.x + cos * distance, laser.y + sin * distance);
+        if occupied((x / RESOLUTION) as usize, (y / RESOLUTION) as usize) {
+            return distance as f32;
+        }
+        distance += 0.002;
+    }
+}
+
+/// A circle of 0.8 m radius about the middle of the room's left half, at 1 m/s.
+fn true_pose(seconds: f64) -> Pose {
+    let (sin, cos) = (seconds / 0.8).sin_cos();
+    Pose::new(
+        2.2 + 0.8 * cos,
+        2.0 + 0.8 * sin,
+        seconds / 0.8 + std::f64::consts::FRAC_PI_2,
+    )
+}
+
+struct BagWriter {
+    writer: mcap::Writer<std::io::BufWriter<fs::File>>,
+}
+
+impl BagWriter {
+    fn create(path: &Path) -> Self {
+        let file = std::io::BufWriter::new(fs::File::create(path).expect("creates"));
+        Self {
+            writer: mcap::Writer::new(file).expect("starts"),
+        }
+    }
+
+    fn channel(&mut self, topic: &str, schema: &str) -> u16 {
+        let schema = self.writer.add_schema(schema, "ros2msg", b"").expect("schema");
+        self.writer
+            .add_channel(schema, topic, "cdr", &std::collections::BTreeMap::new())
+            .expect("channel")
+    }
+
+    fn write<T: Serialize>(&mut self, channel: u16, log_time: Stamp, message: &T) {
+        let header = mcap::records::MessageHeader {
+            channel_id: channel,
+            sequence: 0,
+            log_time: log_time.0 as u64,
+            publish_time: log_time.0 as u64,
+        };
+        self.writer
+            .write_to_known_channel(&header, &ros::encode(message).expect("encodes"))
+            .expect("writes");
+    }
+}
+
+fn header(stamp: Stamp, frame: &str) -> Header {
+    Header {
+        stamp: stamp.into(),
+        frame_id: frame.into(),
+    }
+}
+
+/// Four seconds: 40 Hz scans that arrive 20 ms late, 50 Hz odometry, truth, and the mount; another scanner and
+/// another odometry beside them.
+fn write_bag(folder: &Path) -> PathBuf {
+    let path = folder.join("drive.mcap");
+    let mut bag = BagWriter::create(&path);
+    let scan = bag.channel("/scan", "sensor_msgs/msg/LaserScan");
+    let odometry = bag.channel("/vesc/odom", "nav_msgs/msg/Odometry");
+    let truth = bag.channel("/ground_truth/odom", "nav_msgs/msg/Odometry");
+    let tf = bag.channel("/tf_static", "tf2_msgs/msg/TFMessage");
+    let chatter = bag.channel("/chatter", "std_msgs/msg/String");
+    let start = Stamp(1_700_000_000_000_000_000);
+    let base_link_from_laser = Pose::new(0.27, 0.0, 0.0);
+
+    bag.write(chatter, start, &"not for us".to_owned());
+    let mount = TransformStamped {
+        header: header(start, "base_link"),
+        child_frame_id: "laser".into(),
+        transform: RosPose {
+            position: Vector3 {
+                x: 0.27,
+                y: 0.0,
+                z: 0.1,
+            },
+            orientation: Orientation::default(),
+        },
+    };
+    bag.write(
+        tf,
+        start,
+        &TfMessage {
+            transforms: vec![mount],
+        },
+    );
+    let first = true_pose(0.0);
+    for tick in 0..200 {
+        let seconds = f64::from(tick) * 0.02;
+        let stamp = start.plus(seconds);
+        let pose = true_pose(seconds);
+        let mut message = RosOdometry {
+            header: header(stamp, "odom"),
+            child_frame_id: "base_link".into(),
+            pose: pose.since(first).into(),
+            ..RosOdometry::default()
+        };
+        message.linear.x = 1.0;
+        message.angular.z = 1.0 / 0.8;
+        bag.write(odometry, stamp.plus(0.001), &message);
+        message.header.frame_id = "map".into();
+        message.pose = pose.into();
+        bag.write(truth, stamp, &message);
+    }
+    for tick in 0..160 {
+        let seconds = f64::from(tick) * 0.025;
+        let laser = true_pose(seconds) * base_link_from_laser;
+        let message = LaserScan {
+            header: header(start.plus(seconds), "laser"),
+            angle_min: -2.35,
+            angle_max: 2.35,
+            angle_increment: 0.01,
+            scan_time: 0.025,
+            range_min: 0.02,
+            range_max: 30.0,
+            ranges: (0..471)
+                .map(|beam| range(laser, -2.35 + 0.01 * f64::from(beam)))
+                .collect(),
+            ..LaserScan::default()
+        };
+        bag.write(scan, start.plus(seconds + 0.02), &message);
+    }
+    bag.writer.finish().expect("finishes");
+    path
+}
+
+fn evaluate(map: &Path, bag: &Path, more: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_car-node"))
+        .arg("evaluate")
+        .arg("--map")
+        .arg(map)
+        .arg("--bag")
+        .arg(bag)
+        .args(more)
+        .output()
+        .expect("starts")
+}
+
+#[test]
+fn a_drive_is_localized_measured_and_repeatable() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    let poses = folder.path().join("poses.csv");
+    let run = |poses: &Path| {
+        let poses = poses.to_str().expect("UTF-8");
+        let output = evaluate(
+            &map,
+            &bag,
+            &["--initial-pose", "truth", "--json", "--poses", poses],
+        );
+        assert!(
+            output.status.success(),
+            "{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+        serde_json::from_slice::<serde_json::Value>(&output.stdout).expect("one JSON object")
+    };
+    let report = run(&poses);
+    assert_eq!(report["scans"], 160);
+    let updates = report["updates"].as_u64().expect("a count");
+    assert!(updates >= 158, "{report}");
+    // 5 cm cells and 2 mm steps of the ray: a filter that works is well inside one cell.
+    let rmse = report["position_error_m"]["rmse"]
+        .as_f64()
+        .expect("truth is there");
+    assert!(rmse < 0.05, "{report}");
+    assert!(report["heading_error_rad"]["rmse"].as_f64().expect("truth") < 0.03);
+    assert_eq!(report["excursions"], 0);
+    assert!(
+        report["alignment"]["p05"].as_f64().expect("updates") > 0.8,
+        "{report}"
+    );
+    assert!(report["update_us"]["p50"].is_number());
+    assert!(report["range_table"]["build_ms"].is_number());
+
+    let text = fs::read_to_string(&poses).expect("written");
+    let mut lines = text.lines();
+    assert_eq!(lines.next(), Some("stamp_s,x_m,y_m,heading_rad"));
+    assert_eq!(lines.count() as u64, updates);
+    assert!(text.contains("\n1700000000.050000000,"), "stamps are the scans'");
+
+    let again = folder.path().join("again.csv");
+    run(&again);
+    assert_eq!(
+        text,
+        fs::read_to_string(&again).expect("written"),
+        "same seed, same poses"
+    );
+}
+
+#[test]
+fn what_is_wrong_is_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    let complaint = |map: &Path, bag: &Path, more: &[&str]| {
+        let output = evaluate(map, bag, more);
+        assert!(!output.status.success());
+        assert!(output.stdout.is_empty(), "nothing on stdout but results");
+        String::from_utf8(output.stderr).expect("UTF-8")
+    };
+    let text = complaint(&map, &bag, &["--scan-topic", "/scan_2"]);
+    assert!(
+        text.contains("/scan_2") && text.contains("/vesc/odom"),
+        "names what there is: {text}"
+    );
+    let text = complaint(&map, &bag, &["--params", "no-such-set"]);
+    assert!(text.contains("no-such-set"), "{text}");
+    let text = complaint(&map, &map, &[]);
+    assert!(
+        text.contains("map.yaml") && text.contains("MCAP"),
+        "the map is no bag: {text}"
+    );
+
+    // A bag cut short in the middle, as by a full disk.
+    let bytes = fs::read(&bag).expect("reads");
+    let cut = folder.path().join("cut.mcap");
+    fs::write(&cut, &bytes[..bytes.len() / 2]).expect("writes");
+    let text = complaint(&map, &cut, &[]);
+    assert!(text.contains("cut.mcap"), "{text}");
+}

@@ -1,0 +1,330 @@
+//! The driver: follows a raceline on the *estimate* of the pose, so that a bad estimate costs lap time.
+
+use std::time::Duration;
+
+use maps::{Pose, Raceline, wrap_angle};
+use serde::{Deserialize, Serialize};
+
+use crate::{Controls, VehicleParams};
+
+/// A driver's parameters.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriverParams {
+    /// From one command to the next.
+    pub period: Duration,
+    /// From a command to the start of its effect (radio, controller, servo), which the driver looks ahead over.
+    pub delay: Duration,
+    /// Look-ahead distance at standstill [m].
+    pub lookahead_base: f64,
+    /// Look-ahead distance per speed [s].
+    pub lookahead_gain: f64,
+    /// Least and most look-ahead [m].
+    pub lookahead_range: [f64; 2],
+    /// Speed over the raceline's own.
+    pub speed_scale: f64,
+    /// The raceline's speed is read this far ahead in time [s], because the car answers late.
+    pub speed_lookahead: f64,
+    /// Share of the speed given up per metre beside the line [1/m].
+    pub error_slowdown: f64,
+    /// Distance to keep from a car ahead, bumper to bumper [m].
+    pub gap: f64,
+}
+
+impl Default for DriverParams {
+    fn default() -> Self {
+        Self {
+            period: Duration::from_millis(20),
+            delay: Duration::from_millis(20),
+            lookahead_base: 0.25,
+            lookahead_gain: 0.23,
+            lookahead_range: [0.6, 3.0],
+            speed_scale: 1.0,
+            speed_lookahead: 0.10,
+            error_slowdown: 0.5,
+            gap: 0.8,
+        }
+    }
+}
+
+/// What the localizer tells the driver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// When it is true, since the start of the race.
+    pub time: Duration,
+    /// `map_from_base_link`.
+    pub pose: Pose,
+    /// Forward speed [m/s].
+    pub speed: f64,
+    /// Yaw rate [rad/s].
+    pub yaw_rate: f64,
+}
+
+/// A car ahead on the line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ahead {
+    /// From bumper to bumper [m].
+    pub gap: f64,
+    /// Its speed [m/s].
+    pub speed: f64,
+}
+
+/// What the driver is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Manoeuvre {
+    /// Following the raceline.
+    Racing,
+    /// Coming to rest, because the car points the wrong way or does not move.
+    Stopping,
+    /// Going backwards with the wheel turned, until the given time.
+    Reversing(Duration),
+    /// Going forwards with the wheel turned, until the given time.
+    Turning(Duration),
+}
+
+/// Model- and acceleration-based pursuit (Becker, Imholz et al., ICRA 2023): the look-ahead point asks for a lateral
+/// acceleration, and a model of the car's tyres says which steering angle gives it. Plain pure pursuit steers too
+/// little at speed, because tyres slip.
+#[derive(Debug, Clone)]
+pub struct Driver {
+    params: DriverParams,
+    /// The car as the driver knows it, on good tyres.
+    vehicle: VehicleParams,
+    manoeuvre: Manoeuvre,
+    /// Since when the car has not moved although told to.
+    stuck_since: Option<Duration>,
+}
+
+/// Further off the line's heading than this [rad] the car is turned round at walking speed.
+const LOST_HEADING: f64 = 1.4;
+/// A turning manoeuvre ends below this [rad].
+const FOUND_HEADING: f64 = 0.7;
+/// Speed of manoeuvres [m/s].
+const WALKING: f64 = 0.8;
+/// A manoeuvre's leg.
+const LEG: Duration = Duration::from_millis(900);
+/// Not moving for this long is being stuck.
+const STUCK: Duration = Duration::from_millis(1500);
+
+impl Driver {
+    /// A driver of such a car.
+    pub fn new(params: DriverParams, vehicle: VehicleParams) -> Self {
+        Self {
+            params,
+            vehicle,
+            manoeuvre: Manoeuvre::Racing,
+            stuck_since: None,
+        }
+    }
+
+    /// What the driver is doing.
+    pub fn manoeuvre(&self) -> Manoeuvre {
+        self.manoeuvre
+    }
+
+    /// The driver's parameters.
+    pub fn params(&self) -> &DriverParams {
+        &self.params
+    }
+
+    /// Forgets what happened before: the car was put back on the line.
+    pub fn reset(&mut self) {
+        self.manoeuvre = Manoeuvre::Racing;
+        self.stuck_since = None;
+    }
+
+    /// The command at `now`. Without an estimate the car stands.
+    pub fn drive(
+        &mut self,
+        now: Duration,
+        estimate: Option<&Estimate>,
+        ahead: Option<Ahead>,
+        line: &Raceline,
+    ) -> Controls {
+        let Some(estimate) = estimate.filter(|e| e.pose.is_finite()) else {
+            return Controls::default();
+        };
+        // Where the car will be when the command takes effect.
+        let age = (now.as_secs_f64() - estimate.time.as_secs_f64()).clamp(0.0, 0.2);
+        let horizon = age + self.params.delay.as_secs_f64();
+        let moved = [estimate.speed, 0.0, estimate.yaw_rate].map(|rate| rate * horizon);
+        let pose = estimate.pose * Pose::exp(moved);
+        let position = line.project([pose.x, pose.y]);
+        let off_heading = wrap_angle(pose.heading - position.heading);
+        self.decide(now, estimate.speed, off_heading);
+        match self.manoeuvre {
+            Manoeuvre::Racing => {
+                let speed = self.speed(estimate.speed, position.s, position.d, off_heading, ahead, line);
+                self.note_progress(now, estimate.speed, speed);
+                Controls {
+                    speed,
+                    steering: self.steering(pose, estimate.speed, position.s, line),
+                }
+            }
+            Manoeuvre::Stopping => Controls::default(),
+            // Both legs turn the nose towards the line's heading.
+            Manoeuvre::Reversing(_) => Controls {
+                speed: -WALKING,
+                steering: self.vehicle.max_steering.copysign(off_heading),
+            },
+            Manoeuvre::Turning(_) => Controls {
+                speed: WALKING,
+                steering: -self.vehicle.max_steering.copysign(off_heading),
+            },
+        }
+    }
+
+    /// Chooses the manoeuvre.
+    fn decide(&mut self, now: Duration, speed: f64, off_heading: f64) {
+        let stuck = self.stuck_since.is_some_and(|since| now > since + STUCK);
+        self.manoeuvre = match self.manoeuvre {
+            Manoeuvre::Racing if off_heading.abs() > LOST_HEADING || stuck => Manoeuvre::Stopping,
+            Manoeuvre::Stopping if speed.abs() < 0.2 => Manoeuvre::Reversing(now + LEG),
+            Manoeuvre::Reversing(until) if now > until => Manoeuvre::Turning(now + LEG),
+            Manoeuvre::Turning(until) if now > until || off_heading.abs() < FOUND_HEADING => {
+                if off_heading.abs() < FOUND_HEADING {
+                    Manoeuvre::Racing
+                } else {
+                    Manoeuvre::Reversing(now + LEG)
+                }
+            }
+            same => same,
+        };
+        if self.manoeuvre != Manoeuvre::Racing {
+            self.stuck_since = None;
+        }
+    }
+
+    fn note_progress(&mut self, now: Duration, speed: f64, wanted: f64) {
+        if wanted > 0.3 && speed.abs() < 0.1 {
+            self.stuck_since.get_or_insert(now);
+        } else {
+            self.stuck_since = None;
+        }
+    }
+
+    /// Speed to hold [m/s].
+    fn speed(
+        &self,
+        speed: f64,
+        s: f64,
+        d: f64,
+        off_heading: f64,
+        ahead: Option<Ahead>,
+        line: &Raceline,
+    ) -> f64 {
+        let p = &self.params;
+        let there = line.at(s + speed.max(0.0) * p.speed_lookahead).speed * p.speed_scale;
+        // A decimetre and ten degrees are normal: the car slips.
+        let error = (d.abs() - 0.1).max(0.0) + (off_heading.abs() - 0.2).max(0.0);
+        let wanted = there * (1.0 - p.error_slowdown * error).clamp(0.3, 1.0);
+        match ahead {
+            Some(ahead) => wanted.min((ahead.speed + 1.5 * (ahead.gap - p.gap)).max(0.0)),
+            None => wanted,
+        }
+    }
+
+    /// Steering angle towards the look-ahead point [rad].
+    fn steering(&self, pose: Pose, speed: f64, s: f64, line: &Raceline) -> f64 {
+        let p = &self.params;
+        let [least, most] = p.lookahead_range;
+        let lookahead = (p.lookahead_base + p.lookahead_gain * speed.max(0.0)).clamp(least, most);
+        // From the middle of the car's wheelbase this distance would be a little less; the gain covers it.
+        let target = line.at(s + lookahead);
+        let [x, y] = pose.inverse().transform([target.x, target.y]);
+        let distance_squared = (x * x + y * y).max(0.01);
+        // The circle through the rear axle, along the heading, to the target.
+        let curvature = 2.0 * y / distance_squared;
+        let speed = speed.max(0.5);
+        self.vehicle.steering_for(speed, speed * speed * curvature)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::{PI, TAU};
+
+    fn circle() -> Raceline {
+        let positions: Vec<_> = (0..300)
+            .map(|i| TAU * f64::from(i) / 300.0)
+            .map(|a| [4.0 * a.cos(), 4.0 * a.sin()])
+            .collect();
+        Raceline::through(&positions, 3.0).expect("a valid line")
+    }
+
+    fn at(pose: Pose, speed: f64) -> Estimate {
+        Estimate {
+            time: Duration::ZERO,
+            pose,
+            speed,
+            yaw_rate: 0.0,
+        }
+    }
+
+    fn driver() -> Driver {
+        Driver::new(DriverParams::default(), VehicleParams::default())
+    }
+
+    #[test]
+    fn steers_back_to_the_line_from_either_side() {
+        let line = circle();
+        let on_line = |x: f64| {
+            let estimate = at(Pose::new(x, 0.0, PI / 2.0), 3.0);
+            driver()
+                .drive(Duration::ZERO, Some(&estimate), None, &line)
+                .steering
+        };
+        assert!(on_line(4.5) > on_line(4.0) && on_line(4.0) > on_line(3.5));
+        assert!(on_line(4.0) > 0.0, "the line turns left");
+    }
+
+    #[test]
+    fn stands_without_an_estimate() {
+        let lost = at(
+            Pose {
+                x: f64::NAN,
+                y: 0.0,
+                heading: 0.0,
+            },
+            3.0,
+        );
+        for estimate in [None, Some(&lost)] {
+            let controls = driver().drive(Duration::ZERO, estimate, None, &circle());
+            assert_eq!(controls, Controls::default());
+        }
+    }
+
+    #[test]
+    fn keeps_away_from_a_car_ahead() {
+        let line = circle();
+        let estimate = at(Pose::new(4.0, 0.0, PI / 2.0), 3.0);
+        let speed = |gap| {
+            let ahead = Ahead { gap, speed: 1.0 };
+            driver()
+                .drive(Duration::ZERO, Some(&estimate), Some(ahead), &line)
+                .speed
+        };
+        assert!(speed(0.2) < 1.0 && speed(1.0) > 1.0 && speed(9.0) > 2.5);
+    }
+
+    #[test]
+    fn a_spun_car_stops_then_turns_round() {
+        let line = circle();
+        let mut driver = driver();
+        let backwards = Pose::new(4.0, 0.0, -PI / 2.0);
+        let mut drive = |ms: u64, speed| {
+            let now = Duration::from_millis(ms);
+            let estimate = Estimate {
+                time: now,
+                ..at(backwards, speed)
+            };
+            driver.drive(now, Some(&estimate), None, &line)
+        };
+        assert_eq!(drive(0, 2.0), Controls::default());
+        drive(500, 0.0);
+        assert!(drive(600, 0.0).speed < 0.0);
+        drive(1500, 0.0);
+        assert!(drive(1600, 0.0).speed > 0.0);
+    }
+}

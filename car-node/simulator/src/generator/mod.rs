@@ -1,0 +1,12 @@
+//! Tracks of our own: walls from a centre line, a raceline between them, and the map that SLAM would make of them.
+
+mod mapping;
+mod minimum_curvature;
+mod spec;
+mod speed_profile;
+mod spline;
+
+pub use mapping::{MappingParams, draw_map};
+pub use minimum_curvature::{LineError, minimum_curvature};
+pub use spec::{BUNDLED, BlackStretch, Block, TrackSpec};
+pub use speed_profile::{SpeedParams, speed_profile};

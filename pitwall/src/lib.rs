@@ -1,1 +1,32 @@
-//! Placeholder.
+//! The pit wall: how well every car is localized and why, on one laptop.
+//!
+//! ```text
+//! cars ==zenoh==> link -> FleetEvent -> Fleet (pure state) -> page, terminal, JSON
+//!                              '------> recorder (one MCAP file per session)
+//! ```
+//!
+//! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Link`] is the
+//! only way to the network.
+mod ask;
+mod car;
+mod event;
+mod fleet;
+mod gaps;
+mod hub;
+mod link;
+mod log;
+mod recording;
+mod stream;
+
+pub use ask::{PATIENCE, Verdict, new_command_id};
+pub use car::{Car, CarView, Lap, PoseView, SetView};
+pub use event::{FleetEvent, Happening, Lane};
+pub use fleet::Fleet;
+pub use gaps::{Arrival, GapSummary, Gaps};
+pub use hub::{Hub, StartError};
+pub use link::{DEFAULT_LISTEN, LOCAL_WALL, Link, LinkError, Role, Sink, unix_now};
+pub use log::{Log, LogEntry};
+pub use recording::{
+    Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events, recover,
+};
+pub use stream::{Stream, StreamView};

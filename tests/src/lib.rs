@@ -1,1 +1,45 @@
-//! Placeholder.
+//! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
+//! protocol, and waiting for conditions.
+
+mod fake_car;
+
+pub use fake_car::{Behaviour, FakeCar};
+
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use pitwall::Role;
+
+/// How long anything may take before a test gives up.
+pub const DEADLINE: Duration = Duration::from_secs(20);
+
+/// An endpoint on loopback that nobody else uses.
+pub fn free_endpoint() -> String {
+    // The system hands out a port that is free, and does not hand it out again soon.
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = listener.local_addr().expect("an address");
+    format!("tcp/{address}")
+}
+
+/// A pit wall that listens there.
+pub fn router(endpoint: &str) -> Role {
+    Role::Router {
+        listen: vec![endpoint.to_owned()],
+    }
+}
+
+/// A program that joins the pit wall there.
+pub fn client(endpoint: &str) -> Role {
+    Role::Client {
+        connect: vec![endpoint.to_owned()],
+    }
+}
+
+/// Waits until `condition` holds; panics with `what` when it does not within [`DEADLINE`].
+pub async fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
+    let deadline = Instant::now() + DEADLINE;
+    while !condition() {
+        assert!(Instant::now() < deadline, "not within {DEADLINE:?}: {what}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}

@@ -45,7 +45,6 @@
 //! }
 //! # Ok::<(), maps::RacelineFault>(())
 //! ```
-mod check;
 mod contour;
 mod driver;
 mod generator;
@@ -57,7 +56,6 @@ mod vehicle;
 mod walls;
 mod world;
 
-pub use check::TrackReport;
 pub use driver::{Ahead, Driver, DriverParams, Estimate, Manoeuvre};
 pub use generator::{
     BUNDLED, BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map,

@@ -2,7 +2,6 @@
 
 mod mapping;
 mod minimum_curvature;
-mod random;
 mod spec;
 mod speed_profile;
 mod spline;

@@ -1,0 +1,263 @@
+//! Questions and commands to a car, and what can become of them.
+
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher, Hasher};
+use std::sync::Arc;
+use std::time::Duration;
+
+use protocol::{
+    Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Key,
+    MapReply, Message, Outcome, Stamps, Topic, decode, encode,
+};
+use serde::Serialize;
+use zenoh::query::ConsolidationMode;
+
+use crate::event::Happening;
+use crate::link::{ASK_CONGESTION, ASK_PRIORITY, Link, unix_now};
+
+/// How long a car may take to answer.
+pub const PATIENCE: Duration = Duration::from_secs(2);
+
+/// What became of a command, as the operator sees it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case", tag = "verdict")]
+pub enum Verdict {
+    /// The car has answered: done, refused, or not at the expected revision.
+    Answered {
+        /// The answer.
+        answer: Answer,
+        /// From asking to the answer [s].
+        after_s: f64,
+    },
+    /// No car of that name is there. Nothing has changed.
+    NoSuchCar,
+    /// The car is there and has not answered in time. It may have done it or not: look at the set in force, or
+    /// send the same command again, which is harmless.
+    NoAnswer {
+        /// How long was waited [s].
+        waited_s: f64,
+    },
+    /// Something answered that cannot be read. It may have been done or not.
+    Unreadable {
+        /// What is wrong with it.
+        error: String,
+    },
+}
+
+impl Verdict {
+    /// The exit code of a program that gave the command: 0 done, 3 refused, 4 no such car, 5 no answer, 6 stale
+    /// revision.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Answered { answer, .. } => match answer.outcome {
+                Outcome::Done { .. } => 0,
+                Outcome::Refused { .. } => 3,
+                Outcome::StaleRevision { .. } => 6,
+            },
+            Self::NoSuchCar => 4,
+            Self::NoAnswer { .. } | Self::Unreadable { .. } => 5,
+        }
+    }
+
+    /// What the operator should know: which it was, and what to do next.
+    pub fn text(&self, car: &CarName) -> String {
+        match self {
+            Self::Answered { answer, after_s } => {
+                let set = format!("{} (revision {})", answer.set.name, answer.set.revision);
+                match &answer.outcome {
+                    Outcome::Done { update, .. } => {
+                        let since =
+                            update.map_or_else(String::new, |update| format!(" from update {update}"));
+                        let after = after_s * 1e3;
+                        format!("{car}: done{since}; set in force is {set}; answered in {after:.0} ms")
+                    }
+                    Outcome::Refused { faults } => {
+                        let faults = faults.join("\n  ");
+                        format!("{car}: REFUSED, nothing has changed; set in force is {set}:\n  {faults}")
+                    }
+                    Outcome::StaleRevision { expected, who } => format!(
+                        "{car}: REVISION CONFLICT, nothing has changed: expected revision {expected}, but {who} has \
+                         put {set} in force. Look at it, then give the command again"
+                    ),
+                }
+            }
+            Self::NoSuchCar => format!(
+                "{car}: NO SUCH CAR on this link, nothing has changed. `pitwall cars` lists those there are"
+            ),
+            Self::NoAnswer { waited_s } => format!(
+                "{car}: NO ANSWER within {waited_s:.1} s; it may or may not have been done. See `pitwall params {car}`, \
+                 or give the command again: that is harmless"
+            ),
+            Self::Unreadable { error } => format!(
+                "{car}: the ANSWER CANNOT BE READ ({error}); it may or may not have been done. Are car and pit wall \
+                 of the same version?"
+            ),
+        }
+    }
+}
+
+/// A new command id.
+pub fn new_command_id() -> CommandId {
+    // The keys of a RandomState come from the operating system's random numbers.
+    let random = || u128::from(RandomState::new().build_hasher().finish());
+    CommandId(random() << 64 | (random() ^ unix_now() as u128))
+}
+
+impl Link {
+    /// Gives a car a command and waits for its answer.
+    pub async fn command(
+        &self,
+        car: &CarName,
+        operator: &str,
+        expected_revision: Option<u64>,
+        action: Action,
+    ) -> Result<Verdict, CodecError> {
+        let command = Command {
+            id: new_command_id(),
+            operator: operator.to_owned(),
+            expected_revision,
+            action,
+        };
+        self.send(car, &command, PATIENCE).await
+    }
+
+    /// Sends a command, possibly not for the first time.
+    pub async fn send(
+        &self,
+        car: &CarName,
+        command: &Command,
+        patience: Duration,
+    ) -> Result<Verdict, CodecError> {
+        let begun = std::time::Instant::now();
+        let bytes = encode(command, stamps())?;
+        let answer = self
+            .ask::<Answer>(car, command.action.topic(), bytes, patience)
+            .await;
+        let after_s = begun.elapsed().as_secs_f64();
+        Ok(match answer {
+            Ok(Some(answer)) if answer.id == command.id => Verdict::Answered { answer, after_s },
+            Ok(Some(answer)) => Verdict::Unreadable {
+                error: format!("it answers command {} instead of {}", answer.id, command.id),
+            },
+            // Without a car nothing replies, and zenoh says so at once and without an error.
+            Ok(None) if self.alive(car).await => Verdict::NoAnswer { waited_s: after_s },
+            Ok(None) => Verdict::NoSuchCar,
+            Err(error) => Verdict::Unreadable { error },
+        })
+    }
+
+    /// True when the car's node runs.
+    pub async fn alive(&self, car: &CarName) -> bool {
+        let key = Key::new(car.clone(), Topic::Alive).to_string();
+        let Ok(tokens) = self
+            .session
+            .liveliness()
+            .get(&key)
+            .timeout(Duration::from_secs(1))
+            .await
+        else {
+            return false;
+        };
+        tokens
+            .recv_async()
+            .await
+            .is_ok_and(|reply| reply.result().is_ok())
+    }
+
+    /// Fetches the car's map and hands it on as an event. None when the car does not answer.
+    pub async fn fetch_map(&self, car: &CarName) -> Option<()> {
+        let bytes = self
+            .ask_bytes(car, Topic::Map, Vec::new(), Duration::from_secs(5))
+            .await?;
+        match decode::<MapReply>(&bytes) {
+            Ok((_, map)) => self.hand_on(
+                car,
+                Happening::Map {
+                    map: Arc::new(map),
+                    bytes: bytes.into(),
+                },
+            ),
+            Err(error) => self.hand_on(
+                car,
+                Happening::Unreadable {
+                    topic: Topic::Map,
+                    error: error.to_string(),
+                },
+            ),
+        }
+        Some(())
+    }
+
+    /// Asks what runs on the car and hands it on as an event. None when the car does not answer.
+    pub async fn fetch_info(&self, car: &CarName) -> Option<CarInfo> {
+        let info = self
+            .ask::<CarInfo>(car, Topic::Info, Vec::new(), PATIENCE)
+            .await
+            .ok()??;
+        self.hand_on(car, Happening::Info(info.clone()));
+        Some(info)
+    }
+
+    /// Compares the car's clock with this one and hands the result on as an event.
+    pub async fn compare_clocks(&self, car: &CarName) -> Option<(i64, i64)> {
+        let question = encode(&ClockRequest { sent: unix_now() }, stamps()).ok()?;
+        let reply = self
+            .ask::<ClockReply>(car, Topic::Clock, question, Duration::from_secs(1))
+            .await
+            .ok()??;
+        let (offset, round_trip) = reply.offset_and_round_trip(unix_now());
+        self.hand_on(car, Happening::Clock { offset, round_trip });
+        Some((offset, round_trip))
+    }
+
+    /// The first reply; None when there is none in time.
+    async fn ask<M: Message>(
+        &self,
+        car: &CarName,
+        topic: Topic,
+        question: Vec<u8>,
+        patience: Duration,
+    ) -> Result<Option<M>, String> {
+        match self.ask_bytes(car, topic, question, patience).await {
+            Some(bytes) => decode::<M>(&bytes)
+                .map(|(_, message)| Some(message))
+                .map_err(|e| e.to_string()),
+            None => Ok(None),
+        }
+    }
+
+    async fn ask_bytes(
+        &self,
+        car: &CarName,
+        topic: Topic,
+        question: Vec<u8>,
+        patience: Duration,
+    ) -> Option<Vec<u8>> {
+        let key = Key::new(car.clone(), topic).to_string();
+        let replies = self
+            .session
+            .get(&key)
+            .payload(question)
+            .timeout(patience)
+            .consolidation(ConsolidationMode::None)
+            .congestion_control(ASK_CONGESTION)
+            .priority(ASK_PRIORITY)
+            .await
+            .inspect_err(|error| tracing::warn!(%key, %error, "the question could not be sent"))
+            .ok()?;
+        while let Ok(reply) = replies.recv_async().await {
+            match reply.into_result() {
+                Ok(sample) => return Some(sample.payload().to_bytes().into_owned()),
+                Err(error) => tracing::debug!(%key, ?error, "an error in place of a reply"),
+            }
+        }
+        None
+    }
+}
+
+fn stamps() -> Stamps {
+    Stamps {
+        published: unix_now(),
+        ..Stamps::default()
+    }
+}

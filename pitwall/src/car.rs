@@ -1,0 +1,328 @@
+//! What the pit wall knows of one car.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use protocol::{
+    CarInfo, CarName, Cloud, EventKind, Header, Health, Load, MapReply, Params, Pose, ScanView, State,
+    Telemetry, Topic, Truth,
+};
+use serde::Serialize;
+
+use crate::stream::{Stream, StreamView};
+
+/// A car as the pit wall sees it.
+#[derive(Debug, Clone)]
+pub struct Car {
+    /// Its name.
+    pub name: CarName,
+    /// True while its liveliness token is there.
+    pub alive: bool,
+    /// When it was first heard of [unix ns].
+    pub first_seen: i64,
+    /// When anything of it last arrived [unix ns].
+    pub last_heard: i64,
+    /// True once the log has said that the link is gone, until it is back.
+    pub(crate) blind_said: bool,
+    /// The newest pose.
+    pub pose: Option<(Header, Pose)>,
+    /// The newest cloud.
+    pub cloud: Option<Cloud>,
+    /// The newest end points.
+    pub scan: Option<ScanView>,
+    /// The newest health.
+    pub health: Option<Health>,
+    /// The newest load.
+    pub load: Option<Load>,
+    /// The set in force.
+    pub params: Option<Params>,
+    /// Where it really is, where that is known.
+    pub truth: Option<Truth>,
+    /// The map it localizes on, and the bytes that it came in.
+    pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
+    /// What runs on it.
+    pub info: Option<CarInfo>,
+    /// Laps driven, the last [`Car::MAX_LAPS`].
+    pub laps: Vec<Lap>,
+    clock: Option<ClockEstimate>,
+    streams: BTreeMap<Topic, Stream>,
+}
+
+/// A lap that was driven.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Lap {
+    /// Its number, from 1.
+    pub lap: u32,
+    /// Its time [s].
+    pub time_s: f64,
+    /// The set in force at its end.
+    pub set: String,
+}
+
+/// How far the car's clock is ahead of the laptop's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct ClockEstimate {
+    offset: i64,
+    round_trip: i64,
+    at: i64,
+}
+
+impl ClockEstimate {
+    /// An exchange of shorter round trip is believed over this one for so long [ns].
+    const KEEP: i64 = 30_000_000_000;
+}
+
+impl Car {
+    /// Most laps kept.
+    pub const MAX_LAPS: usize = 500;
+    /// A car not heard of for this long is out of sight [ns].
+    pub const BLIND_AFTER: i64 = 1_000_000_000;
+
+    /// A car first heard of at `at` [unix ns].
+    pub fn new(name: CarName, at: i64) -> Self {
+        Self {
+            name,
+            alive: false,
+            first_seen: at,
+            last_heard: at,
+            blind_said: false,
+            pose: None,
+            cloud: None,
+            scan: None,
+            health: None,
+            load: None,
+            params: None,
+            truth: None,
+            map: None,
+            info: None,
+            laps: Vec::new(),
+            clock: None,
+            streams: BTreeMap::new(),
+        }
+    }
+
+    /// Takes in a message that arrived at `at` [unix ns]. True when it was the newest of its stream.
+    pub(crate) fn take(&mut self, topic: Topic, header: &Header, telemetry: &Telemetry, at: i64) -> bool {
+        self.last_heard = self.last_heard.max(at);
+        let newest = self.streams.entry(topic).or_default().arrive(header, at);
+        if !newest {
+            return false;
+        }
+        match telemetry {
+            // The full-rate pose is the same pose again, held back until gaps are filled: not for display.
+            Telemetry::Pose(_) | Telemetry::Health(_) if topic.recorded() => {}
+            Telemetry::Pose(pose) => self.pose = Some((*header, *pose)),
+            Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
+            Telemetry::Scan(scan) => self.scan = Some(scan.clone()),
+            Telemetry::Health(health) => self.health = Some(health.clone()),
+            Telemetry::Load(load) => self.load = Some(load.clone()),
+            Telemetry::Params(params) => self.params = Some(params.clone()),
+            Telemetry::Truth(truth) => self.truth = Some(*truth),
+            Telemetry::Event(event) => {
+                if let EventKind::Lap {
+                    lap,
+                    time: Some(time),
+                    set,
+                } = &event.kind
+                {
+                    if self.laps.len() == Self::MAX_LAPS {
+                        self.laps.remove(0);
+                    }
+                    self.laps.push(Lap {
+                        lap: *lap,
+                        time_s: *time,
+                        set: set.clone(),
+                    });
+                }
+            }
+            Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
+        }
+        true
+    }
+
+    /// Takes note of bytes that could not be read. True for the first of their topic.
+    pub(crate) fn refuse(&mut self, topic: Topic) -> bool {
+        self.streams.entry(topic).or_default().refuse() == 1
+    }
+
+    /// Takes note of a comparison of clocks.
+    pub(crate) fn set_clock(&mut self, offset: i64, round_trip: i64, at: i64) {
+        let better = self
+            .clock
+            .is_none_or(|old| round_trip <= old.round_trip || at - old.at > ClockEstimate::KEEP);
+        if better {
+            self.clock = Some(ClockEstimate {
+                offset,
+                round_trip,
+                at,
+            });
+        }
+    }
+
+    /// What must be added to the laptop's clock to get the car's, and the round-trip time [ns, ns]; None until they
+    /// were compared.
+    pub fn clock(&self) -> Option<(i64, i64)> {
+        self.clock.map(|clock| (clock.offset, clock.round_trip))
+    }
+
+    /// What must be added to the laptop's clock to get the car's [ns]; 0 until they were compared.
+    pub fn clock_offset(&self) -> i64 {
+        self.clock.map_or(0, |clock| clock.offset)
+    }
+
+    /// True when nothing comes from the car at `now` [unix ns].
+    pub fn blind(&self, now: i64) -> bool {
+        !self.alive || now - self.last_heard > Self::BLIND_AFTER
+    }
+
+    /// The car at `now` [unix ns].
+    pub fn view(&self, now: i64) -> CarView {
+        let seconds = |ns: i64| ns as f64 * 1e-9;
+        let offset = self.clock_offset();
+        let blind = self.blind(now);
+        let quiet_s = seconds(now - self.last_heard).max(0.0);
+        let (state, causes) = match &self.health {
+            _ if blind => (
+                "BLIND".to_owned(),
+                vec![format!("nothing heard for {quiet_s:.1} s")],
+            ),
+            None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
+            Some(health) => (
+                health.state.to_string(),
+                health.causes.iter().map(ToString::to_string).collect(),
+            ),
+        };
+        let best = self.laps.iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
+        CarView {
+            car: self.name.clone(),
+            state,
+            causes,
+            state_for_s: self
+                .health
+                .as_ref()
+                .map(|health| seconds(now + offset - health.since).max(0.0)),
+            blind,
+            alive: self.alive,
+            quiet_s,
+            pose: self.pose.map(|(header, pose)| PoseView {
+                x_m: pose.pose.x,
+                y_m: pose.pose.y,
+                heading_rad: pose.pose.heading,
+                speed_mps: pose.twist.linear_x.hypot(pose.twist.linear_y),
+                covariance: pose.covariance,
+                s_m: pose.track.map(|track| track.s),
+                d_m: pose.track.map(|track| track.d),
+                lap: pose.lap,
+                update: pose.update,
+                age_s: seconds(now + offset - header.sensor),
+            }),
+            set: self.params.as_ref().map(|params| SetView {
+                name: params.set.name.clone(),
+                revision: params.revision,
+                who: params.who.clone(),
+                when: params.when,
+                available: params.available.clone(),
+                reverts_to: params.pending_revert.as_ref().map(|revert| revert.to.clone()),
+                reverts_in_s: params
+                    .pending_revert
+                    .as_ref()
+                    .map(|revert| seconds(revert.at - now - offset).max(0.0)),
+            }),
+            health: self.health.clone(),
+            load: self.load.clone(),
+            round_trip_s: self.clock.map(|clock| seconds(clock.round_trip)),
+            clock_offset_s: self.clock.map(|clock| seconds(clock.offset)),
+            streams: self
+                .streams
+                .iter()
+                .map(|(topic, stream)| (topic.as_str(), stream.view(now, offset)))
+                .collect(),
+            last_lap_s: self.laps.last().map(|lap| lap.time_s),
+            best_lap_s: best,
+            info: self.info.clone(),
+        }
+    }
+}
+
+/// A car, ready to be shown or written as JSON.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CarView {
+    /// Its name.
+    pub car: CarName,
+    /// The state in capitals: one of the car's own, or `BLIND` when nothing comes from it.
+    pub state: String,
+    /// Why, in words, the worst first.
+    pub causes: Vec<String>,
+    /// How long the car's own state has lasted [s].
+    pub state_for_s: Option<f64>,
+    /// True when nothing comes from the car: everything below is old.
+    pub blind: bool,
+    /// True while the car's node is known to run.
+    pub alive: bool,
+    /// Time since anything arrived [s].
+    pub quiet_s: f64,
+    /// The newest pose.
+    pub pose: Option<PoseView>,
+    /// The parameter set in force.
+    pub set: Option<SetView>,
+    /// The newest health message.
+    pub health: Option<Health>,
+    /// The newest load message.
+    pub load: Option<Load>,
+    /// Round-trip time to the car [s].
+    pub round_trip_s: Option<f64>,
+    /// How far the car's clock is ahead of this one; right to within half the round-trip time [s].
+    pub clock_offset_s: Option<f64>,
+    /// Every stream by topic.
+    pub streams: BTreeMap<&'static str, StreamView>,
+    /// The last lap [s].
+    pub last_lap_s: Option<f64>,
+    /// The best lap [s].
+    pub best_lap_s: Option<f64>,
+    /// What runs on the car.
+    pub info: Option<CarInfo>,
+}
+
+/// A pose, ready to be shown.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PoseView {
+    /// Position in `map` [m].
+    pub x_m: f64,
+    /// Position in `map` [m].
+    pub y_m: f64,
+    /// Heading [rad].
+    pub heading_rad: f64,
+    /// Speed over ground [m/s].
+    pub speed_mps: f64,
+    /// Uncertainty.
+    pub covariance: protocol::Covariance,
+    /// Arc length on the raceline [m].
+    pub s_m: Option<f64>,
+    /// Distance from the raceline, left positive [m].
+    pub d_m: Option<f64>,
+    /// Laps begun.
+    pub lap: u32,
+    /// The filter update.
+    pub update: u64,
+    /// Time since it was true [s].
+    pub age_s: f64,
+}
+
+/// The set in force, ready to be shown.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SetView {
+    /// Its name.
+    pub name: String,
+    /// Its revision.
+    pub revision: u64,
+    /// Who put it in force.
+    pub who: String,
+    /// When [unix ns, the car's clock].
+    pub when: i64,
+    /// All sets on the car.
+    pub available: Vec<String>,
+    /// The set that the car falls back to unless this one is confirmed.
+    pub reverts_to: Option<String>,
+    /// When it does [s from now].
+    pub reverts_in_s: Option<f64>,
+}

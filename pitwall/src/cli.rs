@@ -1,0 +1,295 @@
+//! The command line.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand};
+use protocol::{CarName, Pose2};
+
+/// The pit wall: how well every car is localized and why.
+#[derive(Debug, Parser)]
+#[command(version, after_help = EXIT_CODES)]
+pub(crate) struct Cli {
+    #[command(flatten)]
+    pub(crate) link: LinkOptions,
+    /// Write JSON on stdout instead of text.
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    #[command(subcommand)]
+    pub(crate) verb: Verb,
+}
+
+const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \
+none does, this program listens for the cars itself, on tcp/0.0.0.0:7447, while it runs.
+
+Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict.";
+
+#[derive(Debug, Args)]
+pub(crate) struct LinkOptions {
+    /// Listen for cars here, as tcp/ADDRESS:PORT; may be given several times.
+    #[arg(long, global = true, value_name = "ENDPOINT")]
+    pub(crate) listen: Vec<String>,
+    /// Join a running pit wall or router there.
+    #[arg(long, global = true, value_name = "ENDPOINT", conflicts_with = "listen")]
+    pub(crate) connect: Vec<String>,
+    /// Your name, as the cars and the others at the pit wall see it; $USER unless given.
+    #[arg(long, global = true, value_name = "NAME")]
+    operator: Option<String>,
+}
+
+impl LinkOptions {
+    /// Who gives commands.
+    pub(crate) fn operator(&self) -> String {
+        let user = || std::env::var("USER").ok().filter(|user| !user.is_empty());
+        self.operator
+            .clone()
+            .or_else(user)
+            .unwrap_or_else(|| "pitwall".to_owned())
+    }
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    /// List the cars: state and cause, set in force, rates, ages, losses.
+    Cars {
+        /// How long to listen before the list is written.
+        #[arg(long, default_value = "2s", value_parser = duration)]
+        wait: Duration,
+    },
+    /// Follow one car: state, pose, rates, age, set in force.
+    Watch {
+        /// The car.
+        car: CarName,
+        /// Stop after this time.
+        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        time: Option<Duration>,
+        /// Views per second; 5 on a terminal, else 1.
+        #[arg(long, value_name = "HZ")]
+        rate: Option<f64>,
+    },
+    /// Look at a car's parameter sets, or change the one in force.
+    Params {
+        /// The car.
+        car: CarName,
+        #[command(subcommand)]
+        verb: Option<ParamsVerb>,
+    },
+    /// Tell a car where it is, or let it search.
+    Locate {
+        /// The car.
+        car: CarName,
+        #[command(flatten)]
+        how: Locate,
+    },
+    /// See or set how often a car sends what.
+    Rates {
+        /// The car.
+        car: CarName,
+        #[command(flatten)]
+        rates: RateOptions,
+    },
+    /// Let a car switch sets by itself, or not.
+    Auto {
+        /// The car.
+        car: CarName,
+        /// On or off.
+        #[arg(value_parser = on_off, action = clap::ArgAction::Set)]
+        on: bool,
+    },
+    /// List what happened.
+    Events {
+        /// Only this car.
+        car: Option<CarName>,
+        /// Go on until interrupted.
+        #[arg(long, short)]
+        follow: bool,
+    },
+    /// Record all cars into an MCAP file, until interrupted.
+    Record {
+        /// The new file; never overwritten.
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
+        /// Stop after this time.
+        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        time: Option<Duration>,
+    },
+    /// Repair a recording that was cut off.
+    Recover {
+        /// The damaged file; it stays as it is.
+        file: PathBuf,
+        /// The new file; FILE.recovered.mcap unless given.
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ParamsVerb {
+    /// Show the set in force, every value.
+    Get,
+    /// List all sets on the car.
+    List,
+    /// Compare two sets of the car.
+    Diff {
+        /// One set.
+        a: String,
+        /// The other.
+        b: String,
+    },
+    /// Put a set of the car in force.
+    Select {
+        /// Its name.
+        name: String,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Store a set from a YAML or JSON file on the car, and put it in force.
+    Put {
+        /// The file: `parameter: value`, one a line. What it does not name keeps its value.
+        file: PathBuf,
+        /// The set's name; the file's unless given.
+        #[arg(long)]
+        name: Option<String>,
+        #[command(flatten)]
+        change: Change,
+    },
+    /// Keep the set in force: the car will not fall back by itself.
+    Confirm {
+        #[command(flatten)]
+        change: Expect,
+    },
+    /// Go back to the set that was in force before.
+    Revert {
+        #[command(flatten)]
+        change: Expect,
+    },
+    /// Delete a set that was put on the car.
+    Delete {
+        /// Its name.
+        name: String,
+        #[command(flatten)]
+        change: Expect,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Change {
+    /// Fall back by itself after this time unless confirmed.
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    pub(crate) revert_after: Option<Duration>,
+    #[command(flatten)]
+    pub(crate) expect: Expect,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Expect {
+    /// Only if the set in force has this revision.
+    #[arg(long, value_name = "REVISION")]
+    pub(crate) expect: Option<u64>,
+}
+
+#[derive(Debug, Args)]
+#[group(required = true)]
+pub(crate) struct Locate {
+    /// Where it is: x, y [m] and heading [rad] in the map.
+    #[arg(long, value_name = "X,Y,HEADING", value_parser = pose, allow_hyphen_values = true, conflicts_with_all = ["global", "pick"])]
+    pub(crate) pose: Option<Pose2>,
+    /// Let it search the whole map and show the candidates.
+    #[arg(long)]
+    pub(crate) global: bool,
+    /// Take this candidate of the last search.
+    #[arg(long, value_name = "N", conflicts_with = "global")]
+    pub(crate) pick: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct RateOptions {
+    /// Poses per second.
+    #[arg(long, value_name = "HZ")]
+    pub(crate) pose: Option<f32>,
+    /// Particle clouds per second.
+    #[arg(long, value_name = "HZ")]
+    pub(crate) cloud: Option<f32>,
+    /// Scan views per second.
+    #[arg(long, value_name = "HZ")]
+    pub(crate) scan: Option<f32>,
+    /// Health messages per second.
+    #[arg(long, value_name = "HZ")]
+    pub(crate) health: Option<f32>,
+    /// Send the full-rate streams for the recorder: on or off.
+    #[arg(long, value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
+    pub(crate) recorded: Option<bool>,
+}
+
+/// `30s`, `5m`, `1.5h`, `200ms`, or a bare number of seconds.
+fn duration(text: &str) -> Result<Duration, String> {
+    let split = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let scale = match unit {
+        "ms" => 1e-3,
+        "" | "s" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(format!("unknown unit {unit:?}; use ms, s, m or h")),
+    };
+    let number: f64 = number
+        .trim()
+        .parse()
+        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
+    Duration::try_from_secs_f64(number * scale).map_err(|error| format!("{text:?}: {error}"))
+}
+
+fn on_off(text: &str) -> Result<bool, String> {
+    match text {
+        "on" => Ok(true),
+        "off" => Ok(false),
+        _ => Err("say on or off".to_owned()),
+    }
+}
+
+fn pose(text: &str) -> Result<Pose2, String> {
+    let numbers: Vec<f64> = text
+        .split(',')
+        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .collect::<Result<_, _>>()?;
+    match numbers[..] {
+        [x, y, heading] if numbers.iter().all(|n| n.is_finite()) => Ok(Pose2 { x, y, heading }),
+        [_, _, _] => Err("all three must be finite".to_owned()),
+        _ => Err("say X,Y,HEADING, as in 1.5,-0.2,3.14".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_makes_sense() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn times_are_read_as_people_write_them() {
+        assert_eq!(duration("30s"), Ok(Duration::from_secs(30)));
+        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("200ms"), Ok(Duration::from_millis(200)));
+        assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
+        for text in ["", "s", "-1s", "1y", "NaN"] {
+            assert!(duration(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_pose_is_three_numbers() {
+        let expected = Pose2 {
+            x: 1.0,
+            y: -2.0,
+            heading: 0.5,
+        };
+        assert_eq!(pose("1, -2,0.5"), Ok(expected));
+        for text in ["1,2", "1,2,x", "1,2,NaN", "1,2,3,4"] {
+            assert!(pose(text).is_err(), "{text}");
+        }
+    }
+}

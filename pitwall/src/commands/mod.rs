@@ -1,0 +1,79 @@
+//! The verbs.
+
+mod cars;
+mod events;
+mod params;
+mod record;
+mod steer;
+mod watch;
+
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use pitwall::{Hub, Role};
+use protocol::CarName;
+
+use crate::cli::{Cli, LinkOptions, Verb};
+use crate::output;
+
+/// How long a car may take to be found: those that dial a pit wall that was just opened try again every second.
+const FIND: Duration = Duration::from_secs(3);
+
+/// Exit code: no car of that name.
+const NO_SUCH_CAR: u8 = 4;
+
+/// Does what the command line says.
+pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
+    let Cli { link, json, verb } = cli;
+    match verb {
+        Verb::Cars { wait } => cars::run(&link, wait, json).await,
+        Verb::Watch { car, time, rate } => watch::run(&link, &car, time, rate, json).await,
+        Verb::Params { car, verb } => params::run(&link, &car, verb, json).await,
+        Verb::Locate { car, how } => steer::locate(&link, &car, &how, json).await,
+        Verb::Rates { car, rates } => steer::rates(&link, &car, &rates, json).await,
+        Verb::Auto { car, on } => steer::auto(&link, &car, on, json).await,
+        Verb::Events { car, follow } => events::run(&link, car, follow, json).await,
+        Verb::Record { output, time } => record::record(&link, &output, time, json).await,
+        Verb::Recover { file, output } => record::recover(&file, output, json),
+    }
+}
+
+async fn open(options: &LinkOptions) -> anyhow::Result<Arc<Hub>> {
+    let role = Role::choose(&options.listen, &options.connect);
+    tracing::info!("{role}");
+    Ok(Hub::open(&role).await?)
+}
+
+/// Says that a car is not there.
+async fn no_such_car(hub: &Hub, car: &CarName) -> ExitCode {
+    let others: Vec<_> = hub.fleet().cars().map(|car| car.name.to_string()).collect();
+    let others = if others.is_empty() {
+        "no car is on this link".to_owned()
+    } else {
+        format!("there are {}", others.join(", "))
+    };
+    output::complain(&format!("no such car: {car}; {others}"));
+    hub.close().await;
+    ExitCode::from(NO_SUCH_CAR)
+}
+
+/// Ends when the program is asked to stop.
+async fn interrupted() {
+    use tokio::signal::unix::{SignalKind, signal};
+    let Ok(mut terminate) = signal(SignalKind::terminate()) else {
+        return std::future::pending().await;
+    };
+    tokio::select! {
+        _ = tokio::signal::ctrl_c() => {}
+        _ = terminate.recv() => {}
+    }
+}
+
+/// Ends after `time`, or when the program is asked to stop.
+async fn time_or_interrupt(time: Option<Duration>) {
+    match time {
+        Some(time) => drop(tokio::time::timeout(time, interrupted()).await),
+        None => interrupted().await,
+    }
+}

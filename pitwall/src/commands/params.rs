@@ -1,0 +1,257 @@
+//! `pitwall params`
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use protocol::{Action, CarName, ParameterSet, Params, ParamsAction, Reply, StoredSet, Value};
+use serde::Deserialize;
+
+use super::steer::{give, reply, tell};
+use super::{FIND, no_such_car, open};
+use crate::cli::{LinkOptions, ParamsVerb};
+use crate::output;
+
+pub(super) async fn run(
+    link: &LinkOptions,
+    car: &CarName,
+    verb: Option<ParamsVerb>,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let millis = |time: Duration| u32::try_from(time.as_millis()).context("--revert-after is too long");
+    let (action, expect) = match verb {
+        None | Some(ParamsVerb::Get) => return get(link, car, json).await,
+        Some(ParamsVerb::List) => return list(link, car, None, json).await,
+        Some(ParamsVerb::Diff { a, b }) => return list(link, car, Some((a, b)), json).await,
+        Some(ParamsVerb::Select { name, change }) => {
+            let revert_after_ms = change.revert_after.map(millis).transpose()?;
+            (
+                ParamsAction::Select {
+                    name,
+                    revert_after_ms,
+                },
+                change.expect,
+            )
+        }
+        Some(ParamsVerb::Put { file, name, change }) => {
+            let set = read_set(&file, name)?;
+            let revert_after_ms = change.revert_after.map(millis).transpose()?;
+            (ParamsAction::Put { set, revert_after_ms }, change.expect)
+        }
+        Some(ParamsVerb::Confirm { change }) => (ParamsAction::Confirm, change),
+        Some(ParamsVerb::Revert { change }) => (ParamsAction::Revert, change),
+        Some(ParamsVerb::Delete { name, change }) => (ParamsAction::Delete { name }, change),
+    };
+    give(link, car, Action::Params(action), expect.expect, json).await
+}
+
+/// The set in force, as the car last said it.
+async fn get(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
+    const NO_ANSWER: u8 = 5;
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(no_such_car(&hub, car).await);
+    }
+    hub.wait_until(FIND, |fleet| {
+        fleet.car(car).is_some_and(|car| car.params.is_some())
+    })
+    .await;
+    let params = hub.fleet().car(car).and_then(|car| car.params.clone());
+    hub.close().await;
+    let Some(params) = params else {
+        output::complain(&format!(
+            "{car}: NO ANSWER: it has not said which set is in force"
+        ));
+        return Ok(ExitCode::from(NO_ANSWER));
+    };
+    if json {
+        output::say_json(&params)?;
+    } else {
+        output::say(&describe(&params));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn describe(params: &Params) -> String {
+    let Params {
+        set,
+        revision,
+        who,
+        since_update,
+        ..
+    } = params;
+    let mut lines = vec![format!(
+        "{} (revision {revision}), put in force by {who} from update {since_update}",
+        set.name
+    )];
+    if let Some(revert) = &params.pending_revert {
+        lines.push(format!("falls back to {} unless confirmed", revert.to));
+    }
+    lines.push(format!("on the car: {}", params.available.join(", ")));
+    lines.extend(values(set));
+    lines.join("\n")
+}
+
+fn values(set: &ParameterSet) -> Vec<String> {
+    let width = set.values.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    let line = |(name, value): &(String, Value)| format!("  {name:<width$}  {value}");
+    set.values.iter().map(line).collect()
+}
+
+/// All sets, or how two of them differ.
+async fn list(
+    link: &LinkOptions,
+    car: &CarName,
+    diff: Option<(String, String)>,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(no_such_car(&hub, car).await);
+    }
+    let action = Action::Params(ParamsAction::List);
+    let verdict = hub.link().command(car, &link.operator(), None, action).await?;
+    let Some(Reply::Sets(sets)) = reply(&verdict) else {
+        return tell(&hub, car, &verdict, json).await;
+    };
+    hub.close().await;
+    let Some((a, b)) = diff else {
+        if json {
+            output::say_json(sets)?;
+        } else {
+            for StoredSet { set, built_in, who } in sets {
+                let origin = match who {
+                    Some(who) => format!("put by {who}"),
+                    None if *built_in => "ships with the car".to_owned(),
+                    None => String::new(),
+                };
+                output::say(&format!(
+                    "{:<20} {:>3} values  {origin}",
+                    set.name,
+                    set.values.len()
+                ));
+            }
+        }
+        return Ok(ExitCode::SUCCESS);
+    };
+    let find = |name: &str| {
+        let stored = sets.iter().find(|stored| stored.set.name == name);
+        stored
+            .map(|stored| &stored.set)
+            .with_context(|| format!("no set {name} on {car}"))
+    };
+    let differences = differences(find(&a)?, find(&b)?);
+    if json {
+        output::say_json(&differences)?;
+    } else if differences.is_empty() {
+        output::say(&format!("{a} and {b} are the same"));
+    } else {
+        output::say(&format!("{:<32} {a:>16} {b:>16}", "parameter"));
+        let show = |value: &Option<Value>| value.as_ref().map_or("-".to_owned(), ToString::to_string);
+        for (name, [a, b]) in &differences {
+            output::say(&format!("{name:<32} {:>16} {:>16}", show(a), show(b)));
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The values in which two sets differ.
+fn differences(a: &ParameterSet, b: &ParameterSet) -> BTreeMap<String, [Option<Value>; 2]> {
+    let mut all: BTreeMap<String, [Option<Value>; 2]> = BTreeMap::new();
+    for (at, set) in [a, b].into_iter().enumerate() {
+        for (name, value) in &set.values {
+            all.entry(name.clone()).or_default()[at] = Some(value.clone());
+        }
+    }
+    all.retain(|_, [a, b]| a != b);
+    all
+}
+
+/// A value as people write it.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Scalar {
+    Bool(bool),
+    Int(i64),
+    Float(f64),
+    Text(String),
+}
+
+/// Reads a set from a YAML or JSON file.
+fn read_set(file: &Path, name: Option<String>) -> anyhow::Result<ParameterSet> {
+    let shown = file.display();
+    let text = std::fs::read_to_string(file).with_context(|| format!("{shown}"))?;
+    let Some(name) = name.or_else(|| Some(file.file_stem()?.to_str()?.to_owned())) else {
+        bail!("{shown}: give the set a --name");
+    };
+    let scalars: BTreeMap<String, Scalar> =
+        serde_saphyr::from_str(&text).map_err(|error| anyhow::anyhow!("{shown}: {error}"))?;
+    let values = scalars
+        .into_iter()
+        .map(|(name, scalar)| {
+            let value = match scalar {
+                Scalar::Bool(value) => Value::Bool(value),
+                Scalar::Int(value) => Value::Int(value),
+                Scalar::Float(value) => Value::Float(value),
+                Scalar::Text(value) => Value::Text(value),
+            };
+            (name, value)
+        })
+        .collect();
+    Ok(ParameterSet { name, values })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_set_is_read_as_people_write_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("wet.yaml");
+        std::fs::write(
+            &file,
+            "max_particles: 2000\nsigma_hit: 0.1\nmotion_model: tum\ndeskew: true\n",
+        )
+        .expect("written");
+        let set = read_set(&file, None).expect("a good file");
+        assert_eq!(set.name, "wet");
+        assert_eq!(
+            set.values,
+            [
+                ("deskew".into(), Value::Bool(true)),
+                ("max_particles".into(), Value::Int(2000)),
+                ("motion_model".into(), Value::Text("tum".into())),
+                ("sigma_hit".into(), Value::Float(0.1)),
+            ]
+        );
+    }
+
+    #[test]
+    fn a_bad_file_is_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("wet.yaml");
+        std::fs::write(&file, "sigma_hit: [1, 2]\n").expect("written");
+        let error = read_set(&file, None).expect_err("a list is no value");
+        assert!(error.to_string().contains("wet.yaml"), "{error}");
+    }
+
+    #[test]
+    fn only_what_differs_is_shown() {
+        let set = |values: &[(&str, i64)]| ParameterSet {
+            name: "x".into(),
+            values: values
+                .iter()
+                .map(|&(name, value)| (name.to_owned(), Value::Int(value)))
+                .collect(),
+        };
+        let found = differences(&set(&[("a", 1), ("b", 2)]), &set(&[("a", 1), ("b", 3), ("c", 4)]));
+        let expected = BTreeMap::from([
+            ("b".to_owned(), [Some(Value::Int(2)), Some(Value::Int(3))]),
+            ("c".to_owned(), [None, Some(Value::Int(4))]),
+        ]);
+        assert_eq!(found, expected);
+    }
+}

@@ -1,0 +1,62 @@
+//! `pitwall record` and `pitwall recover`
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::Context;
+
+use super::{FIND, NO_SUCH_CAR, open, time_or_interrupt};
+use crate::cli::LinkOptions;
+use crate::output;
+
+pub(super) async fn record(
+    link: &LinkOptions,
+    file: &Path,
+    time: Option<Duration>,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let hub = open(link).await?;
+    hub.start_recording(file).await?;
+    let waiting = hub.wait_until(FIND, |fleet| fleet.cars().any(|car| car.alive));
+    tokio::select! {
+        found = waiting => if !found {
+            output::note("no car is on this link yet; whatever comes is recorded");
+        },
+        () = super::interrupted() => {}
+    }
+    output::note(&format!(
+        "recording all cars into {}; Ctrl-C ends it",
+        file.display()
+    ));
+    time_or_interrupt(time).await;
+    let summary = hub.stop_recording().await.context("the recorder is gone")??;
+    hub.close().await;
+    if json {
+        output::say_json(&summary)?;
+    } else {
+        output::say(&summary.to_string());
+    }
+    if summary.streams.is_empty() {
+        output::complain(&format!("no car was heard: {} is empty", file.display()));
+        return Ok(ExitCode::from(NO_SUCH_CAR));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+pub(super) fn recover(file: &Path, output: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
+    let to = output.unwrap_or_else(|| file.with_extension("recovered.mcap"));
+    let recovered = pitwall::recover(file, &to)?;
+    if json {
+        output::say_json(&recovered)?;
+    } else {
+        let damage = recovered.damage.as_deref().unwrap_or("the file was whole");
+        output::say(&format!(
+            "{}: {} messages over {:.1} s saved ({damage})",
+            to.display(),
+            recovered.messages,
+            recovered.duration_s
+        ));
+    }
+    Ok(ExitCode::SUCCESS)
+}

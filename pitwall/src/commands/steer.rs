@@ -1,0 +1,147 @@
+//! `pitwall locate`, `pitwall rates` and `pitwall auto`, and how any command's outcome is told.
+
+use std::process::ExitCode;
+
+use pitwall::{Hub, Verdict};
+use protocol::{Action, CarName, Outcome, Rates, RatesAction, RelocalizeAction, Reply};
+
+use super::{FIND, no_such_car, open};
+use crate::cli::{LinkOptions, Locate, RateOptions};
+use crate::output;
+
+pub(super) async fn locate(
+    link: &LinkOptions,
+    car: &CarName,
+    how: &Locate,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let action = match (how.pose, how.pick) {
+        (Some(pose), _) => Action::Pose(pose),
+        (None, Some(candidate)) => Action::Relocalize(RelocalizeAction::Pick { candidate }),
+        (None, None) => Action::Relocalize(RelocalizeAction::Search),
+    };
+    give(link, car, action, None, json).await
+}
+
+pub(super) async fn auto(
+    link: &LinkOptions,
+    car: &CarName,
+    on: bool,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    give(link, car, Action::Auto(on), None, json).await
+}
+
+pub(super) async fn rates(
+    link: &LinkOptions,
+    car: &CarName,
+    wanted: &RateOptions,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(no_such_car(&hub, car).await);
+    }
+    let verdict = hub
+        .link()
+        .command(car, &link.operator(), None, Action::Rates(RatesAction::Get))
+        .await?;
+    let now = reply(&verdict).and_then(|reply| match reply {
+        Reply::Rates(rates) => Some(*rates),
+        _ => None,
+    });
+    let RateOptions {
+        pose,
+        cloud,
+        scan,
+        health,
+        recorded,
+    } = wanted;
+    let change =
+        pose.is_some() || cloud.is_some() || scan.is_some() || health.is_some() || recorded.is_some();
+    let verdict = match now {
+        Some(now) if change => {
+            let rates = Rates {
+                pose: pose.unwrap_or(now.pose),
+                cloud: cloud.unwrap_or(now.cloud),
+                scan: scan.unwrap_or(now.scan),
+                health: health.unwrap_or(now.health),
+                recorded: recorded.unwrap_or(now.recorded),
+            };
+            let action = Action::Rates(RatesAction::Set(rates));
+            hub.link().command(car, &link.operator(), None, action).await?
+        }
+        _ => verdict,
+    };
+    tell(&hub, car, &verdict, json).await
+}
+
+/// Gives a command and tells what became of it.
+pub(super) async fn give(
+    link: &LinkOptions,
+    car: &CarName,
+    action: Action,
+    expect: Option<u64>,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(no_such_car(&hub, car).await);
+    }
+    let verdict = hub.link().command(car, &link.operator(), expect, action).await?;
+    tell(&hub, car, &verdict, json).await
+}
+
+/// Tells what became of a command; its exit code does too.
+pub(super) async fn tell(
+    hub: &Hub,
+    car: &CarName,
+    verdict: &Verdict,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    if json {
+        output::say_json(verdict)?;
+    } else {
+        match reply(verdict) {
+            Some(Reply::Candidates(candidates)) => {
+                for c in candidates {
+                    let heading = c.pose.heading.to_degrees();
+                    output::say(&format!(
+                        "candidate {}: ({:.2}, {:.2}) m, {heading:.1} deg, {:.0} % of the end points on walls",
+                        c.number,
+                        c.pose.x,
+                        c.pose.y,
+                        c.score * 100.0
+                    ));
+                }
+            }
+            Some(Reply::Rates(rates)) => {
+                let recorded = if rates.recorded { "on" } else { "off" };
+                output::say(&format!(
+                    "pose {} Hz, cloud {} Hz, scan {} Hz, health {} Hz, full-rate streams {recorded}",
+                    rates.pose, rates.cloud, rates.scan, rates.health
+                ));
+            }
+            _ => {}
+        }
+        let text = verdict.text(car);
+        if verdict.exit_code() == 0 {
+            output::say(&text);
+        } else {
+            output::complain(&text);
+        }
+    }
+    hub.close().await;
+    Ok(ExitCode::from(verdict.exit_code()))
+}
+
+/// What a command that was done has brought.
+pub(super) fn reply(verdict: &Verdict) -> Option<&Reply> {
+    match verdict {
+        Verdict::Answered { answer, .. } => match &answer.outcome {
+            Outcome::Done { reply, .. } => Some(reply),
+            _ => None,
+        },
+        _ => None,
+    }
+}

@@ -1,0 +1,335 @@
+//! All cars, as a pure state: events go in, views come out. No clock, no network.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use protocol::{CarName, Event, EventKind, Header, Severity, Telemetry, Topic};
+
+use crate::car::{Car, CarView};
+use crate::event::{FleetEvent, Happening};
+use crate::log::{Log, LogEntry};
+
+/// What the pit wall knows.
+///
+/// A live pit wall and a replay do the same: [`Fleet::apply`] for each event, [`Fleet::tick`] as time passes.
+#[derive(Debug, Clone, Default)]
+pub struct Fleet {
+    cars: BTreeMap<CarName, Car>,
+    log: Log,
+}
+
+impl Fleet {
+    /// Takes in an event.
+    pub fn apply(&mut self, event: &FleetEvent) {
+        let FleetEvent {
+            at,
+            car: name,
+            happening,
+        } = event;
+        let at = *at;
+        let car = self
+            .cars
+            .entry(name.clone())
+            .or_insert_with(|| Car::new(name.clone(), at));
+        match happening {
+            Happening::Appeared => {
+                car.alive = true;
+                car.last_heard = car.last_heard.max(at);
+            }
+            Happening::Vanished => car.alive = false,
+            Happening::Message {
+                topic,
+                header,
+                telemetry,
+                ..
+            } => {
+                let known = car.take(*topic, header, telemetry, at);
+                if let (Telemetry::Event(event), Topic::Event) = (&**telemetry, topic)
+                    && known
+                {
+                    let when = happened_at(header) - car.clock_offset();
+                    self.log.push(entry_of(event, name, when));
+                }
+            }
+            Happening::Unreadable { topic, error } => {
+                let first = car.refuse(*topic);
+                if first {
+                    self.log.push(LogEntry {
+                        number: 0,
+                        at,
+                        car: Some(name.clone()),
+                        severity: Severity::Warning,
+                        kind: "unreadable",
+                        text: format!("{topic} cannot be read: {error}"),
+                        who: None,
+                    });
+                }
+            }
+            Happening::Map { map, bytes } => car.map = Some((Arc::clone(map), Arc::clone(bytes))),
+            Happening::Info(info) => car.info = Some(info.clone()),
+            Happening::Marker { who, text } => {
+                let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
+                self.say(at, car, Severity::Info, "marker", text, who);
+            }
+            Happening::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
+        }
+        self.notice_link(&name.clone(), at);
+    }
+
+    /// Lets time pass until `now` [unix ns]: cars that have fallen silent are noticed.
+    pub fn tick(&mut self, now: i64) {
+        let names: Vec<_> = self.cars.keys().cloned().collect();
+        for name in names {
+            self.notice_link(&name, now);
+        }
+    }
+
+    /// Adds a line of the pit wall's own to the log.
+    pub fn say(
+        &mut self,
+        at: i64,
+        car: Option<CarName>,
+        severity: Severity,
+        kind: &'static str,
+        text: String,
+        who: Option<String>,
+    ) {
+        self.log.push(LogEntry {
+            number: 0,
+            at,
+            car,
+            severity,
+            kind,
+            text,
+            who,
+        });
+    }
+
+    /// The cars by name.
+    pub fn cars(&self) -> impl Iterator<Item = &Car> {
+        self.cars.values()
+    }
+
+    /// A car.
+    pub fn car(&self, name: &CarName) -> Option<&Car> {
+        self.cars.get(name)
+    }
+
+    /// All cars at `now` [unix ns].
+    pub fn view(&self, now: i64) -> Vec<CarView> {
+        self.cars().map(|car| car.view(now)).collect()
+    }
+
+    /// What happened.
+    pub fn log(&self) -> &Log {
+        &self.log
+    }
+
+    /// Says once when a car falls silent, and once when it is back.
+    fn notice_link(&mut self, name: &CarName, now: i64) {
+        let Some(car) = self.cars.get_mut(name) else {
+            return;
+        };
+        let blind = car.blind(now);
+        if blind == car.blind_said || (blind && now - car.first_seen <= Car::BLIND_AFTER) {
+            return;
+        }
+        car.blind_said = blind;
+        let (severity, text) = if !blind {
+            (Severity::Info, "link is back")
+        } else if car.alive {
+            (Severity::Critical, "BLIND: nothing comes from the car")
+        } else {
+            (Severity::Critical, "BLIND: the car's node or its link has gone")
+        };
+        self.say(now, Some(name.clone()), severity, "link", text.to_owned(), None);
+    }
+}
+
+fn entry_of(event: &Event, car: &CarName, at: i64) -> LogEntry {
+    let kind = match &event.kind {
+        EventKind::StateChanged { .. } => "state",
+        EventKind::ParametersChanged { .. }
+        | EventKind::ParametersConfirmed { .. }
+        | EventKind::ParametersFellBack { .. }
+        | EventKind::SetStored { .. }
+        | EventKind::SetDeleted { .. }
+        | EventKind::Proposed { .. }
+        | EventKind::AutoChanged { .. } => "set",
+        EventKind::PoseInitialized { .. } | EventKind::SearchStarted | EventKind::Relocalized { .. } => {
+            "pose"
+        }
+        EventKind::Lap { .. } => "lap",
+        EventKind::SlipStarted { .. } | EventKind::SlipEnded { .. } => "slip",
+        EventKind::Started { .. } | EventKind::Stopping { .. } | EventKind::SourceEnded => "node",
+        EventKind::RatesChanged => "rates",
+        EventKind::CommandRefused { .. } => "refused",
+        EventKind::Warning { .. } => "warning",
+        EventKind::Error { .. } => "error",
+    };
+    LogEntry {
+        number: 0,
+        at,
+        car: Some(car.clone()),
+        severity: event.kind.severity(),
+        kind,
+        text: event.kind.to_string(),
+        who: event.who.clone(),
+    }
+}
+
+/// When an event happened, by the car's clock [unix ns]. Those that no sensor caused carry no sensor time.
+fn happened_at(header: &Header) -> i64 {
+    if header.sensor == 0 {
+        header.published
+    } else {
+        header.sensor
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::event::Lane;
+    use protocol::{Health, Schema, Stamps, State};
+
+    const SECOND: i64 = 1_000_000_000;
+
+    fn name() -> CarName {
+        CarName::new("car-1").expect("a good name")
+    }
+
+    fn message(at: i64, sequence: u64, lane: Lane, topic: Topic, telemetry: Telemetry) -> FleetEvent {
+        let stamps = Stamps {
+            session: 1,
+            sequence,
+            sensor: at,
+            published: at,
+        };
+        FleetEvent {
+            at,
+            car: name(),
+            happening: Happening::Message {
+                topic,
+                lane,
+                header: Header::new(Schema::Health, 1, stamps),
+                telemetry: Box::new(telemetry),
+                bytes: Arc::new([]),
+            },
+        }
+    }
+
+    fn health(state: State) -> Telemetry {
+        Telemetry::Health(Health {
+            state,
+            since: 0,
+            causes: Vec::new(),
+            update: 1,
+            metrics: None,
+            proposal: None,
+            auto: false,
+        })
+    }
+
+    fn appeared(at: i64) -> FleetEvent {
+        FleetEvent {
+            at,
+            car: name(),
+            happening: Happening::Appeared,
+        }
+    }
+
+    #[test]
+    fn both_lanes_together_count_each_message_once() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        for (sequence, lane) in [
+            (1, Lane::Live),
+            (1, Lane::Complete),
+            (3, Lane::Live),
+            (2, Lane::Complete),
+            (3, Lane::Complete),
+        ] {
+            fleet.apply(&message(
+                1,
+                sequence,
+                lane,
+                Topic::Health,
+                health(State::Localized),
+            ));
+        }
+        let view = &fleet.view(2)[0].streams["health"];
+        assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
+    }
+
+    #[test]
+    fn a_late_message_does_not_turn_the_state_back() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        fleet.apply(&message(
+            1,
+            1,
+            Lane::Live,
+            Topic::Health,
+            health(State::Localized),
+        ));
+        fleet.apply(&message(1, 3, Lane::Live, Topic::Health, health(State::Lost)));
+        fleet.apply(&message(
+            1,
+            2,
+            Lane::Complete,
+            Topic::Health,
+            health(State::Degraded),
+        ));
+        assert_eq!(fleet.view(2)[0].state, "LOST");
+    }
+
+    #[test]
+    fn a_silent_car_is_blind_and_said_so_once() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        fleet.apply(&message(
+            0,
+            1,
+            Lane::Live,
+            Topic::Health,
+            health(State::Localized),
+        ));
+        fleet.tick(SECOND / 2);
+        assert_eq!(fleet.view(SECOND / 2)[0].state, "LOCALIZED");
+        for tick in 3..6 {
+            fleet.tick(tick * SECOND);
+        }
+        assert_eq!(fleet.view(6 * SECOND)[0].state, "BLIND");
+        fleet.apply(&message(
+            7 * SECOND,
+            2,
+            Lane::Live,
+            Topic::Health,
+            health(State::Localized),
+        ));
+        let said: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
+        assert_eq!(said, ["BLIND: nothing comes from the car", "link is back"]);
+    }
+
+    #[test]
+    fn laps_are_counted_once() {
+        let mut fleet = Fleet::default();
+        let lap = || {
+            Telemetry::Event(Event {
+                kind: EventKind::Lap {
+                    lap: 1,
+                    time: Some(9.2),
+                    set: "hq".into(),
+                },
+                update: 1,
+                who: None,
+                command: None,
+            })
+        };
+        fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
+        fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
+        assert_eq!(fleet.car(&name()).map(|car| car.laps.len()), Some(1));
+        assert_eq!(fleet.log().since(0).count(), 1);
+    }
+}

@@ -1,0 +1,329 @@
+//! Writes one recording.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fmt;
+use std::io::{Seek, Write};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{WriteOptions, Writer};
+use protocol::{CarName, Key, Topic};
+use serde::Serialize;
+
+use super::foxglove::{self, Exported};
+use super::note::Note;
+use crate::event::{FleetEvent, Happening};
+use crate::gaps::{Arrival, GapSummary, Gaps};
+
+/// Encoding of messages as they came.
+pub(super) const WIRE_ENCODING: &str = "synpf-v1";
+/// Name of the metadata record that says what is in the file.
+pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
+
+/// A recording being written.
+pub(super) struct RecordingFile<W: Write + Seek> {
+    writer: Writer<W>,
+    channels: HashMap<String, u16>,
+    schemas: HashMap<&'static str, u16>,
+    streams: BTreeMap<Key, Gaps>,
+    notes: u32,
+    messages: u64,
+    first: Option<i64>,
+    last: Option<i64>,
+}
+
+impl<W: Write + Seek> RecordingFile<W> {
+    pub(super) fn new(writer: W) -> Result<Self, mcap::McapError> {
+        let options = WriteOptions::new()
+            .profile("")
+            .library(concat!("pitwall ", env!("CARGO_PKG_VERSION")));
+        Ok(Self {
+            writer: options.create(writer)?,
+            channels: HashMap::new(),
+            schemas: HashMap::new(),
+            streams: BTreeMap::new(),
+            notes: 0,
+            messages: 0,
+            first: None,
+            last: None,
+        })
+    }
+
+    /// Writes an event. A message that is in the file already is not written again.
+    pub(super) fn write(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
+        let FleetEvent { at, car, happening } = event;
+        match happening {
+            Happening::Message {
+                topic,
+                header,
+                telemetry,
+                bytes,
+                ..
+            } => {
+                let key = Key::new(car.clone(), *topic);
+                let name = key.to_string();
+                let gaps = self.streams.entry(key).or_default();
+                if gaps.arrive(header.session, header.sequence) == Arrival::Repeated {
+                    return Ok(());
+                }
+                let times = Times {
+                    arrived: *at,
+                    published: header.published,
+                    sequence: header.sequence as u32,
+                };
+                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
+                // The full-rate twins of live topics would only repeat them.
+                if !topic.recorded() || *topic == Topic::RecordedTruth {
+                    for exported in foxglove::export(car, header, telemetry) {
+                        self.write_json(car, &exported, times)?;
+                    }
+                }
+            }
+            Happening::Map { map, bytes } => {
+                let name = Key::new(car.clone(), Topic::Map).to_string();
+                let times = Times {
+                    arrived: *at,
+                    published: *at,
+                    sequence: 0,
+                };
+                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
+                self.write_json(car, &foxglove::export_map(map, *at), times)?;
+            }
+            other => {
+                if let Some(note) = Note::of(other) {
+                    self.notes += 1;
+                    let times = Times {
+                        arrived: *at,
+                        published: *at,
+                        sequence: self.notes,
+                    };
+                    let json = serde_json::to_vec(&note).map_err(|e| mcap::McapError::Io(e.into()))?;
+                    self.write_to(&Note::channel(car), "json", 0, times, &json)?;
+                }
+            }
+        }
+        self.first.get_or_insert(*at);
+        self.last = self.last.max(Some(*at));
+        self.messages += 1;
+        Ok(())
+    }
+
+    /// Puts everything written so far into the file.
+    pub(super) fn flush(&mut self) -> Result<(), mcap::McapError> {
+        self.writer.flush()
+    }
+
+    /// What is in the file.
+    pub(super) fn summary(&self) -> Summary {
+        Summary {
+            duration_s: self
+                .first
+                .zip(self.last)
+                .map_or(0.0, |(a, b)| (b - a) as f64 * 1e-9),
+            messages: self.messages,
+            streams: self
+                .streams
+                .iter()
+                .map(|(key, gaps)| StreamSummary {
+                    car: key.car.clone(),
+                    topic: key.topic,
+                    gaps: gaps.summary(),
+                })
+                .collect(),
+        }
+    }
+
+    /// Writes the summary and the index, and ends the file.
+    pub(super) fn finish(mut self) -> Result<(Summary, W), mcap::McapError> {
+        let summary = self.summary();
+        let metadata = summary
+            .streams
+            .iter()
+            .map(|stream| {
+                let key = Key::new(stream.car.clone(), stream.topic).to_string();
+                (key, serde_json::to_string(&stream.gaps).unwrap_or_default())
+            })
+            .collect();
+        self.writer.write_metadata(&Metadata {
+            name: SUMMARY_RECORD.to_owned(),
+            metadata,
+        })?;
+        self.writer.finish()?;
+        Ok((summary, self.writer.into_inner()))
+    }
+
+    fn write_json(
+        &mut self,
+        car: &CarName,
+        exported: &Exported,
+        times: Times,
+    ) -> Result<(), mcap::McapError> {
+        let schema = if let Some(&schema) = self.schemas.get(exported.schema) {
+            schema
+        } else {
+            let text = foxglove::schema(exported.schema, &exported.json).to_string();
+            let schema = self
+                .writer
+                .add_schema(exported.schema, "jsonschema", text.as_bytes())?;
+            self.schemas.insert(exported.schema, schema);
+            schema
+        };
+        let channel = format!("/{car}/{}", exported.channel);
+        self.write_to(
+            &channel,
+            "json",
+            schema,
+            times,
+            exported.json.to_string().as_bytes(),
+        )
+    }
+
+    fn write_to(
+        &mut self,
+        topic: &str,
+        encoding: &str,
+        schema: u16,
+        times: Times,
+        data: &[u8],
+    ) -> Result<(), mcap::McapError> {
+        let channel_id = if let Some(&channel) = self.channels.get(topic) {
+            channel
+        } else {
+            let channel = self
+                .writer
+                .add_channel(schema, topic, encoding, &BTreeMap::new())?;
+            self.channels.insert(topic.to_owned(), channel);
+            channel
+        };
+        let header = MessageHeader {
+            channel_id,
+            sequence: times.sequence,
+            log_time: times.arrived.max(0) as u64,
+            publish_time: times.published.max(0) as u64,
+        };
+        self.writer.write_to_known_channel(&header, data)
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Times {
+    arrived: i64,
+    published: i64,
+    sequence: u32,
+}
+
+/// What is in a recording, and what is not.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct Summary {
+    /// From the first event to the last [s].
+    pub duration_s: f64,
+    /// Messages and notes.
+    pub messages: u64,
+    /// Every stream.
+    pub streams: Vec<StreamSummary>,
+}
+
+/// One stream of a recording.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StreamSummary {
+    /// The car.
+    pub car: CarName,
+    /// The topic.
+    pub topic: Topic,
+    /// What came and what did not.
+    #[serde(flatten)]
+    pub gaps: GapSummary,
+}
+
+impl Summary {
+    /// Messages that were sent and are not in the file.
+    pub fn missing(&self) -> u64 {
+        self.streams.iter().map(|stream| stream.gaps.missing).sum()
+    }
+}
+
+impl fmt::Display for Summary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{:<12} {:<18} {:>9} {:>9} {:>9} {:>9}",
+            "car", "stream", "first", "last", "received", "missing"
+        )?;
+        for StreamSummary { car, topic, gaps } in &self.streams {
+            writeln!(
+                f,
+                "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9}",
+                gaps.first, gaps.last, gaps.received, gaps.missing
+            )?;
+            for [from, to] in gaps.missing_ranges.iter().take(10) {
+                writeln!(f, "{:<12} {:<18} missing {from} to {to}", "", "")?;
+            }
+            if gaps.missing_ranges.len() > 10 {
+                writeln!(f, "{:<31} and {} more ranges", "", gaps.missing_ranges.len() - 10)?;
+            }
+        }
+        let missing = match self.missing() {
+            0 => "nothing is missing".to_owned(),
+            1 => "1 message is missing".to_owned(),
+            n => format!("{n} messages are missing"),
+        };
+        write!(
+            f,
+            "{} messages in {:.1} s; {missing}",
+            self.messages, self.duration_s
+        )
+    }
+}
+
+/// Why a recording cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordingError {
+    /// The file exists: recordings are never overwritten.
+    #[error("{0} exists already; recordings are never overwritten")]
+    Exists(String),
+    /// The file cannot be opened, written or read.
+    #[error("{file}: {source}")]
+    Io {
+        /// The file.
+        file: String,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The file's format is broken, or writing it failed.
+    #[error("{file}: {source}")]
+    Mcap {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        source: mcap::McapError,
+    },
+    /// A message in the file cannot be read.
+    #[error("{file}: {channel} number {sequence}: {reason}")]
+    Message {
+        /// The file.
+        file: String,
+        /// The channel.
+        channel: String,
+        /// The message's sequence number.
+        sequence: u32,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+impl RecordingError {
+    pub(super) fn io(file: &std::path::Path, source: std::io::Error) -> Self {
+        let file = file.display().to_string();
+        if source.kind() == std::io::ErrorKind::AlreadyExists {
+            Self::Exists(file)
+        } else {
+            Self::Io { file, source }
+        }
+    }
+
+    pub(super) fn mcap(file: &std::path::Path, source: mcap::McapError) -> Self {
+        Self::Mcap {
+            file: file.display().to_string(),
+            source,
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! What a recording holds beside messages.
+
+use std::sync::Arc;
+
+use protocol::{CarInfo, CarName, Topic};
+use serde::{Deserialize, Serialize};
+
+use crate::event::Happening;
+
+/// A happening that no message carries.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "note")]
+pub(super) enum Note {
+    Appeared,
+    Vanished,
+    Unreadable { topic: Topic, error: String },
+    Info { info: CarInfo },
+    Clock { offset: i64, round_trip: i64 },
+    Marker { who: String, text: String },
+}
+
+impl Note {
+    /// What every note's channel begins with.
+    pub(super) const PREFIX: &str = "pitwall/";
+    const SUFFIX: &str = "/note";
+
+    pub(super) fn channel(car: &CarName) -> String {
+        format!("{}{car}{}", Self::PREFIX, Self::SUFFIX)
+    }
+
+    /// The car that a channel of notes is about.
+    pub(super) fn car(channel: &str) -> Option<CarName> {
+        channel
+            .strip_prefix(Self::PREFIX)?
+            .strip_suffix(Self::SUFFIX)?
+            .parse()
+            .ok()
+    }
+
+    /// The note for a happening; None for those that are bytes of their own.
+    pub(super) fn of(happening: &Happening) -> Option<Self> {
+        Some(match happening {
+            Happening::Appeared => Self::Appeared,
+            Happening::Vanished => Self::Vanished,
+            Happening::Unreadable { topic, error } => Self::Unreadable {
+                topic: *topic,
+                error: error.clone(),
+            },
+            Happening::Info(info) => Self::Info { info: info.clone() },
+            Happening::Clock { offset, round_trip } => Self::Clock {
+                offset: *offset,
+                round_trip: *round_trip,
+            },
+            Happening::Marker { who, text } => Self::Marker {
+                who: who.to_string(),
+                text: text.to_string(),
+            },
+            Happening::Message { .. } | Happening::Map { .. } => return None,
+        })
+    }
+}
+
+impl From<Note> for Happening {
+    fn from(note: Note) -> Self {
+        match note {
+            Note::Appeared => Self::Appeared,
+            Note::Vanished => Self::Vanished,
+            Note::Unreadable { topic, error } => Self::Unreadable { topic, error },
+            Note::Info { info } => Self::Info(info),
+            Note::Clock { offset, round_trip } => Self::Clock { offset, round_trip },
+            Note::Marker { who, text } => Self::Marker {
+                who: Arc::from(who),
+                text: Arc::from(text),
+            },
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! One stream of a car: rate, age, losses.
+
+use std::collections::VecDeque;
+
+use protocol::Header;
+use serde::Serialize;
+
+use crate::gaps::{Arrival, Gaps};
+
+/// What is known of one topic of one car.
+#[derive(Debug, Clone, Default)]
+pub struct Stream {
+    gaps: Gaps,
+    arrivals: VecDeque<i64>,
+    newest: Option<Header>,
+    unreadable: u64,
+    late_by: f64,
+}
+
+impl Stream {
+    /// Arrivals that a rate is taken over.
+    const WINDOW: usize = 64;
+
+    /// Takes note of a message that arrived at `at` [unix ns]. True when it is newer than all before it.
+    pub fn arrive(&mut self, header: &Header, at: i64) -> bool {
+        let arrival = self.gaps.arrive(header.session, header.sequence);
+        if arrival == Arrival::Repeated {
+            return false;
+        }
+        if self.arrivals.len() == Self::WINDOW {
+            self.arrivals.pop_front();
+        }
+        self.arrivals.push_back(at);
+        let order = |h: &Header| (h.session, h.sequence);
+        let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
+        if newer {
+            self.newest = Some(*header);
+            self.late_by = (at - header.published) as f64 * 1e-9;
+        }
+        newer
+    }
+
+    /// Takes note of bytes that could not be read; returns how many there were.
+    pub fn refuse(&mut self) -> u64 {
+        self.unreadable += 1;
+        self.unreadable
+    }
+
+    /// The newest message's header.
+    pub fn newest(&self) -> Option<Header> {
+        self.newest
+    }
+
+    /// When the last message arrived [unix ns].
+    pub fn last_arrival(&self) -> Option<i64> {
+        self.arrivals.back().copied()
+    }
+
+    /// Messages per second, up to `now` [unix ns]; falls when nothing comes.
+    pub fn rate(&self, now: i64) -> f64 {
+        let (Some(first), Some(last)) = (self.arrivals.front(), self.arrivals.back()) else {
+            return 0.0;
+        };
+        // A pause of one interval is what a steady stream has anyway.
+        let intervals = (self.arrivals.len() - 1) as f64;
+        let span = (last - first) as f64 * 1e-9;
+        let pause = (now - last) as f64 * 1e-9;
+        if intervals == 0.0 {
+            return if pause < 1.5 { 1.0 } else { 0.0 };
+        }
+        let usual = span / intervals;
+        intervals / (span + (pause - usual).max(0.0)).max(1e-9)
+    }
+
+    /// The stream at `now` [unix ns], the car's clock being `offset` [ns] ahead of the laptop's.
+    pub fn view(&self, now: i64, offset: i64) -> StreamView {
+        let seconds = |ns: i64| ns as f64 * 1e-9;
+        StreamView {
+            rate_hz: self.rate(now),
+            age_s: self.newest.map(|h| seconds(now + offset - h.sensor)),
+            transit_s: self.newest.map(|_| self.late_by + seconds(offset)),
+            received: self.gaps.received(),
+            missing: self.gaps.missing(),
+            filled_late: self.gaps.filled(),
+            sender_restarts: self.gaps.restarts(),
+            unreadable: self.unreadable,
+        }
+    }
+}
+
+/// A stream in numbers.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StreamView {
+    /// Messages per second [Hz].
+    pub rate_hz: f64,
+    /// Time since the newest content was true [s].
+    pub age_s: Option<f64>,
+    /// From publishing to arrival, of the newest message [s].
+    pub transit_s: Option<f64>,
+    /// Different messages that came.
+    pub received: u64,
+    /// Messages that were sent and did not come.
+    pub missing: u64,
+    /// Messages that came late, out of the sender's cache.
+    pub filled_late: u64,
+    /// How often the sender started again.
+    pub sender_restarts: u64,
+    /// Payloads that could not be read.
+    pub unreadable: u64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::{Schema, Stamps};
+
+    const SECOND: i64 = 1_000_000_000;
+
+    fn header(sequence: u64) -> Header {
+        let stamps = Stamps {
+            session: 1,
+            sequence,
+            sensor: 0,
+            published: 0,
+        };
+        Header::new(Schema::Pose, 1, stamps)
+    }
+
+    #[test]
+    fn the_rate_is_steady_and_falls_in_silence() {
+        let mut stream = Stream::default();
+        for i in 0..100 {
+            stream.arrive(&header(i + 1), i as i64 * SECOND / 40);
+        }
+        let last = 99 * SECOND / 40;
+        assert!((stream.rate(last) - 40.0).abs() < 0.01);
+        assert!((stream.rate(last + SECOND / 41) - 40.0).abs() < 0.01);
+        assert!(stream.rate(last + 2 * SECOND) < 20.0);
+        assert!(stream.rate(last + 100 * SECOND) < 1.0);
+    }
+
+    #[test]
+    fn an_older_message_fills_a_gap_but_is_not_newer() {
+        let mut stream = Stream::default();
+        assert!(stream.arrive(&header(1), 0));
+        assert!(stream.arrive(&header(3), 1));
+        assert!(!stream.arrive(&header(2), 2));
+        assert!(!stream.arrive(&header(3), 3));
+        let view = stream.view(0, 0);
+        assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
+    }
+}

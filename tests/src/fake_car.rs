@@ -1,0 +1,457 @@
+//! A car made of nothing but protocol and zenoh: it drives in a circle and does as it is told.
+
+use std::collections::BTreeMap;
+use std::f64::consts::TAU;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use pitwall::unix_now;
+use protocol::{
+    Action, Answer, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Command,
+    Covariance, Event, EventKind, Health, Key, MapReply, Message, Metrics, Outcome, ParameterSet, Params,
+    ParamsAction, Pose, Pose2, PoseKind, RecordedOdometry, Reply, SetRef, Stamps, State, Topic, Twist2,
+    Value, decode, encode,
+};
+use tokio::task::JoinHandle;
+use zenoh::{Config, Session};
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
+
+/// What a fake car does wrong.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Behaviour {
+    /// It does not answer commands.
+    pub mute: bool,
+    /// It publishes bytes that are no message, as load.
+    pub babbles: bool,
+}
+
+/// A running fake car. Dropping it ends it without a good-bye.
+pub struct FakeCar {
+    name: CarName,
+    state: Arc<Mutex<CarState>>,
+    running: Arc<AtomicBool>,
+    driver: Option<JoinHandle<()>>,
+    session: Session,
+}
+
+/// What it has sent, and the set in force.
+struct CarState {
+    published: BTreeMap<Topic, u64>,
+    set: SetRef,
+    who: String,
+    session: u64,
+}
+
+impl CarState {
+    fn stamps(&mut self, topic: Topic) -> Stamps {
+        let sequence = self.published.entry(topic).or_default();
+        *sequence += 1;
+        let now = unix_now();
+        Stamps {
+            session: self.session,
+            sequence: *sequence,
+            sensor: now - 2_000_000,
+            published: now,
+        }
+    }
+}
+
+/// The sets on the car.
+const SETS: [&str; 2] = ["hq", "lq"];
+
+impl FakeCar {
+    /// Dials the pit wall at `endpoint` and drives off.
+    pub async fn start(name: &str, endpoint: &str, behaviour: Behaviour) -> Self {
+        let name = CarName::new(name).expect("a good name");
+        let session = zenoh::open(config(endpoint)).await.expect("a session");
+        let state = Arc::new(Mutex::new(CarState {
+            published: BTreeMap::new(),
+            set: SetRef {
+                name: "hq".into(),
+                revision: 1,
+            },
+            who: "start".into(),
+            session: unix_now() as u64,
+        }));
+        let running = Arc::new(AtomicBool::new(true));
+        let topics = Topics::declare(&session, &name).await;
+        answer_questions(&session, &name, &state, behaviour).await;
+        let driver = tokio::spawn(drive(topics, state.clone(), running.clone(), behaviour));
+        Self {
+            name,
+            state,
+            running,
+            driver: Some(driver),
+            session,
+        }
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &CarName {
+        &self.name
+    }
+
+    /// The number of the last message on each topic.
+    pub fn published(&self) -> BTreeMap<Topic, u64> {
+        self.state.lock().expect("no panic").published.clone()
+    }
+
+    /// The set in force.
+    pub fn set(&self) -> SetRef {
+        self.state.lock().expect("no panic").set.clone()
+    }
+
+    /// Stops publishing, and says what was the last number of each topic. The session stays, so that what was lost
+    /// can still be asked for.
+    pub async fn stop_driving(&mut self) -> BTreeMap<Topic, u64> {
+        self.running.store(false, Ordering::Relaxed);
+        if let Some(driver) = self.driver.take() {
+            driver.await.expect("the car drives on");
+        }
+        self.published()
+    }
+
+    /// Leaves.
+    pub async fn leave(mut self) {
+        self.stop_driving().await;
+        self.session.close().await.expect("closed");
+    }
+}
+
+impl Drop for FakeCar {
+    fn drop(&mut self) {
+        self.running.store(false, Ordering::Relaxed);
+    }
+}
+
+fn config(endpoint: &str) -> Config {
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", r#""peer""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("connect/exit_on_failure", "false".to_owned()),
+        (
+            "connect/retry",
+            r#"{"period_init_ms":100,"period_max_ms":500,"period_increase_factor":2}"#.to_owned(),
+        ),
+        ("listen/endpoints", "[]".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        ("timestamping/enabled", "true".to_owned()),
+        ("transport/link/tx/lease", "2000".to_owned()),
+    ] {
+        config.insert_json5(key, &value).expect("a good setting");
+    }
+    config
+}
+
+struct Topics {
+    session: Session,
+    name: CarName,
+    complete: BTreeMap<Topic, AdvancedPublisher<'static>>,
+    _alive: zenoh::liveliness::LivelinessToken,
+}
+
+impl Topics {
+    async fn declare(session: &Session, name: &CarName) -> Self {
+        let key = |topic| Key::new(name.clone(), topic).to_string();
+        let mut complete = BTreeMap::new();
+        for topic in [
+            Topic::Health,
+            Topic::Load,
+            Topic::Params,
+            Topic::Event,
+            Topic::RecordedPose,
+            Topic::RecordedOdometry,
+        ] {
+            let publisher = session
+                .declare_publisher(key(topic))
+                .cache(CacheConfig::default().max_samples(500))
+                .sample_miss_detection(MissDetectionConfig::default().heartbeat(Duration::from_millis(500)))
+                .publisher_detection()
+                .await
+                .expect("a publisher");
+            complete.insert(topic, publisher);
+        }
+        let alive = session
+            .liveliness()
+            .declare_token(key(Topic::Alive))
+            .await
+            .expect("a token");
+        Self {
+            session: session.clone(),
+            name: name.clone(),
+            complete,
+            _alive: alive,
+        }
+    }
+
+    async fn put(&self, topic: Topic, message: &impl Message, state: &Mutex<CarState>) {
+        let stamps = state.lock().expect("no panic").stamps(topic);
+        let bytes = encode(message, stamps).expect("a good message");
+        let sent = if let Some(publisher) = self.complete.get(&topic) {
+            publisher.put(bytes).await
+        } else {
+            let key = Key::new(self.name.clone(), topic).to_string();
+            self.session.put(key, bytes).await
+        };
+        sent.expect("sent");
+    }
+}
+
+/// 40 poses a second, everything else at its rate.
+async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicBool>, behaviour: Behaviour) {
+    let mut ticks = tokio::time::interval(Duration::from_millis(25));
+    let mut update = 0;
+    while running.load(Ordering::Relaxed) {
+        ticks.tick().await;
+        update += 1;
+        let pose = pose(update);
+        topics.put(Topic::Pose, &pose, &state).await;
+        topics.put(Topic::RecordedPose, &pose, &state).await;
+        let odometry = RecordedOdometry {
+            pose: pose.pose,
+            twist: pose.twist,
+        };
+        topics.put(Topic::RecordedOdometry, &odometry, &state).await;
+        if update % 4 == 1 {
+            topics.put(Topic::Health, &health(update), &state).await;
+            topics.put(Topic::Cloud, &cloud(&pose, update), &state).await;
+        }
+        if update % 40 == 1 {
+            let params = params(&state.lock().expect("no panic"));
+            topics.put(Topic::Params, &params, &state).await;
+        }
+        if update % 80 == 0 {
+            let kind = EventKind::Lap {
+                lap: (update / 80) as u32,
+                time: Some(2.0),
+                set: "hq".into(),
+            };
+            let event = Event {
+                kind,
+                update,
+                who: None,
+                command: None,
+            };
+            topics.put(Topic::Event, &event, &state).await;
+        }
+        if behaviour.babbles && update % 40 == 1 {
+            let load = Key::new(topics.name.clone(), Topic::Load).to_string();
+            topics.session.put(load, vec![0xff; 50]).await.expect("sent");
+        }
+    }
+}
+
+/// A lap of 3 m radius in 2 s.
+fn pose(update: u64) -> Pose {
+    let angle = update as f64 / 80.0 * TAU;
+    Pose {
+        pose: Pose2 {
+            x: 3.0 * angle.cos(),
+            y: 3.0 * angle.sin(),
+            heading: (angle + TAU / 4.0 + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0,
+        },
+        twist: Twist2 {
+            linear_x: 3.0 * TAU / 2.0,
+            linear_y: 0.0,
+            angular: TAU / 2.0,
+        },
+        covariance: Covariance {
+            xx: 0.01,
+            yy: 0.01,
+            hh: 0.001,
+            ..Covariance::default()
+        },
+        track: None,
+        lap: (update / 80) as u32,
+        update,
+        kind: PoseKind::Updated,
+    }
+}
+
+fn health(update: u64) -> Health {
+    Health {
+        state: State::Localized,
+        since: unix_now(),
+        causes: Vec::new(),
+        update,
+        metrics: Some(Metrics {
+            alignment: 0.9,
+            ..Metrics::default()
+        }),
+        proposal: None,
+        auto: false,
+    }
+}
+
+fn cloud(pose: &Pose, update: u64) -> Cloud {
+    let centre = [pose.pose.x, pose.pose.y];
+    Cloud {
+        update,
+        count: 3000,
+        ess_ratio: 0.5,
+        spread_along: 0.1,
+        spread_across: 0.1,
+        second_mode: 0.0,
+        centre,
+        particles: vec![CloudParticle::quantise(pose.pose, centre, 1.0); 100],
+    }
+}
+
+fn parameter_set(name: &str) -> ParameterSet {
+    ParameterSet {
+        name: name.to_owned(),
+        values: vec![("max_particles".into(), Value::Int(3000))],
+    }
+}
+
+fn params(state: &CarState) -> Params {
+    Params {
+        set: parameter_set(&state.set.name),
+        revision: state.set.revision,
+        who: state.who.clone(),
+        when: unix_now(),
+        since_update: 1,
+        pending_revert: None,
+        available: SETS.map(str::to_owned).to_vec(),
+    }
+}
+
+async fn answer_questions(
+    session: &Session,
+    name: &CarName,
+    state: &Arc<Mutex<CarState>>,
+    behaviour: Behaviour,
+) {
+    let key = |topic| Key::new(name.clone(), topic).to_string();
+    let info = CarInfo {
+        version: "0.1.0".into(),
+        started: 1,
+        source: "circle".into(),
+        map: "box".into(),
+        lap_length: None,
+        base_link_from_laser: Pose2::default(),
+        host: "test".into(),
+    };
+    let map = MapReply {
+        name: "box".into(),
+        width: 2,
+        height: 2,
+        resolution: 5.0,
+        origin: Pose2 {
+            x: -5.0,
+            y: -5.0,
+            heading: 0.0,
+        },
+        runs: MapReply::pack([Cell::Free, Cell::Occupied, Cell::Free, Cell::Unknown]),
+        raceline: None,
+    };
+    reply_with(
+        session,
+        key(Topic::Info),
+        encode(&info, Stamps::default()).expect("good"),
+    )
+    .await;
+    reply_with(
+        session,
+        key(Topic::Map),
+        encode(&map, Stamps::default()).expect("good"),
+    )
+    .await;
+    let clock = key(Topic::Clock);
+    let on = clock.clone();
+    session
+        .declare_queryable(&on)
+        .callback(move |query| {
+            let received = unix_now();
+            let payload = query
+                .payload()
+                .map(|p| p.to_bytes().into_owned())
+                .unwrap_or_default();
+            let (_, request) = decode::<ClockRequest>(&payload).expect("a question");
+            let reply = ClockReply {
+                sent: request.sent,
+                received,
+                answered: unix_now(),
+            };
+            respond(&query, &clock, encode(&reply, Stamps::default()).expect("good"));
+        })
+        .background()
+        .await
+        .expect("a queryable");
+    let commands = key(Topic::CmdParams);
+    let on = commands.clone();
+    let state = state.clone();
+    let unanswered = Mutex::new(Vec::new());
+    session
+        .declare_queryable(&on)
+        .callback(move |query| {
+            if behaviour.mute {
+                // A query that is dropped is answered with nothing; one that is kept is not answered at all.
+                unanswered.lock().expect("no panic").push(query);
+                return;
+            }
+            let payload = query
+                .payload()
+                .map(|p| p.to_bytes().into_owned())
+                .unwrap_or_default();
+            let (_, command) = decode::<Command>(&payload).expect("a command");
+            let answer = obey(&mut state.lock().expect("no panic"), &command);
+            respond(
+                &query,
+                &commands,
+                encode(&answer, Stamps::default()).expect("good"),
+            );
+        })
+        .background()
+        .await
+        .expect("a queryable");
+}
+
+async fn reply_with(session: &Session, key: String, bytes: Vec<u8>) {
+    let on = key.clone();
+    session
+        .declare_queryable(&on)
+        .callback(move |query| respond(&query, &key, bytes.clone()))
+        .background()
+        .await
+        .expect("a queryable");
+}
+
+fn respond(query: &zenoh::query::Query, key: &str, bytes: Vec<u8>) {
+    use zenoh::Wait;
+    query.reply(key, bytes).wait().expect("replied");
+}
+
+fn obey(state: &mut CarState, command: &Command) -> Answer {
+    let outcome = match (&command.action, command.expected_revision) {
+        (_, Some(expected)) if expected != state.set.revision => Outcome::StaleRevision {
+            expected,
+            who: state.who.clone(),
+        },
+        (Action::Params(ParamsAction::Select { name, .. }), _) if SETS.contains(&name.as_str()) => {
+            state.set = SetRef {
+                name: name.clone(),
+                revision: state.set.revision + 1,
+            };
+            state.who.clone_from(&command.operator);
+            Outcome::Done {
+                update: Some(1),
+                reply: Reply::Nothing,
+            }
+        }
+        (Action::Params(ParamsAction::Select { name, .. }), _) => Outcome::Refused {
+            faults: vec![format!("no set {name}")],
+        },
+        _ => Outcome::Refused {
+            faults: vec!["not on this car".into()],
+        },
+    };
+    Answer {
+        id: command.id,
+        outcome,
+        set: state.set.clone(),
+    }
+}

@@ -1,0 +1,270 @@
+//! The pit wall against cars made of nothing but protocol.
+
+use std::collections::BTreeMap;
+
+use pitwall::{Hub, Verdict, read_events, unix_now};
+use protocol::{Action, CarName, Outcome, ParamsAction, Topic};
+use system_tests::{Behaviour, DEADLINE, FakeCar, client, free_endpoint, router, wait_until};
+
+fn select(name: &str) -> Action {
+    Action::Params(ParamsAction::Select {
+        name: name.into(),
+        revert_after_ms: None,
+    })
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_car_shows_up_and_is_blind_when_it_leaves() {
+    let endpoint = free_endpoint();
+    // The car is there before the pit wall: it dials until somebody answers.
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    assert!(hub.wait_for(car.name(), DEADLINE).await);
+    let name = car.name().clone();
+    let view = || hub.fleet().car(&name).map(|car| car.view(unix_now()));
+    wait_until("everything that a card shows", || {
+        view().is_some_and(|car| {
+            car.state == "LOCALIZED"
+                && car.pose.is_some()
+                && car.set.is_some()
+                && car.info.is_some()
+                && car.round_trip_s.is_some_and(|s| s < 1.0)
+                && car.streams["pose"].rate_hz > 20.0
+        })
+    })
+    .await;
+    assert!(hub.fleet().car(&name).is_some_and(|car| car.map.is_some()));
+    car.leave().await;
+    wait_until("the car is blind", || {
+        view().is_some_and(|car| car.state == "BLIND" && !car.alive)
+    })
+    .await;
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_second_program_joins_the_pit_wall_that_is_there() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    let viewer = Hub::open(&client(&endpoint)).await.expect("a link");
+    assert!(viewer.wait_for(car.name(), DEADLINE).await);
+    let verdict = viewer
+        .link()
+        .command(car.name(), "ana", None, select("lq"))
+        .await
+        .expect("a good command");
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+    assert_eq!(car.set().name, "lq");
+    let on_both = |hub: &Hub| {
+        let fleet = hub.fleet();
+        fleet.car(car.name()).and_then(|car| {
+            Some((
+                car.params.as_ref()?.set.name.clone(),
+                car.params.as_ref()?.revision,
+            ))
+        })
+    };
+    wait_until("both see the switch", || {
+        on_both(&hub) == Some(("lq".into(), 2)) && on_both(&viewer) == Some(("lq".into(), 2))
+    })
+    .await;
+    viewer.close().await;
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_outcome_of_a_command_is_told_apart() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    let mute = FakeCar::start(
+        "mute",
+        &endpoint,
+        Behaviour {
+            mute: true,
+            ..Behaviour::default()
+        },
+    )
+    .await;
+    assert!(hub.wait_for(car.name(), DEADLINE).await && hub.wait_for(mute.name(), DEADLINE).await);
+    let give = async |name: &CarName, expect, action| {
+        hub.link()
+            .command(name, "ana", expect, action)
+            .await
+            .expect("a good command")
+    };
+
+    let done = give(car.name(), Some(1), select("lq")).await;
+    assert!(
+        matches!(&done, Verdict::Answered { answer, .. } if answer.set.revision == 2),
+        "{done:?}"
+    );
+    let refused = give(car.name(), None, select("wet")).await;
+    assert!(
+        matches!(&refused, Verdict::Answered { answer, .. } if matches!(answer.outcome, Outcome::Refused { .. }))
+    );
+    let stale = give(car.name(), Some(1), select("hq")).await;
+    let none = give(&CarName::new("nobody").expect("a good name"), None, select("hq")).await;
+    let silent = give(mute.name(), None, select("hq")).await;
+
+    let codes: Vec<_> = [&done, &refused, &stale, &none, &silent]
+        .map(Verdict::exit_code)
+        .to_vec();
+    assert_eq!(codes, [0, 3, 6, 4, 5]);
+    let texts: std::collections::BTreeSet<_> = [&done, &refused, &stale, &none, &silent]
+        .map(|verdict| verdict.text(car.name()))
+        .into();
+    assert_eq!(texts.len(), 5, "each reads differently: {texts:?}");
+    assert_eq!(car.set().name, "lq", "only the first command changed anything");
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bytes_that_are_no_message_are_counted_and_said_once() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let babbles = Behaviour {
+        babbles: true,
+        ..Behaviour::default()
+    };
+    let car = FakeCar::start("car-1", &endpoint, babbles).await;
+    wait_until("several payloads were refused", || {
+        let view = hub.fleet().car(car.name()).map(|car| car.view(unix_now()));
+        view.and_then(|car| Some(car.streams.get("load")?.unreadable >= 3))
+            .unwrap_or(false)
+    })
+    .await;
+    let said = hub
+        .fleet()
+        .log()
+        .since(0)
+        .filter(|entry| entry.kind == "unreadable")
+        .count();
+    assert_eq!(said, 1);
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_of_three_cars_holds_every_message() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("session.mcap");
+    hub.start_recording(&file).await.expect("a new file");
+    let mut cars = Vec::new();
+    for name in ["car-1", "car-2", "car-3"] {
+        cars.push(FakeCar::start(name, &endpoint, Behaviour::default()).await);
+    }
+    wait_until("two laps", || {
+        cars.iter()
+            .all(|car| hub.fleet().car(car.name()).is_some_and(|car| car.laps.len() >= 2))
+    })
+    .await;
+    let mut published = BTreeMap::new();
+    for car in &mut cars {
+        let topics = car.stop_driving().await;
+        published.extend(
+            topics
+                .into_iter()
+                .map(|(topic, last)| ((car.name().clone(), topic), last)),
+        );
+    }
+    wait_until("the last message has come", || {
+        let status = hub.recording().expect("a recording");
+        let streams = &status.summary.streams;
+        streams.len() == published.len()
+            && streams
+                .iter()
+                .all(|s| s.gaps.last == published[&(s.car.clone(), s.topic)])
+    })
+    .await;
+    let live = hub.fleet().view(0);
+    let summary = hub
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("a good file");
+    hub.close().await;
+
+    // Newest-wins topics begin with the first message that found a route; what a car keeps begins with its first.
+    for stream in &summary.streams {
+        assert_eq!(stream.gaps.missing, 0, "{summary}");
+        if stream.topic.recovered() {
+            assert_eq!(stream.gaps.first, 1, "{summary}");
+        }
+        assert_eq!(stream.gaps.received, stream.gaps.last - stream.gaps.first + 1);
+    }
+
+    // Reading it back gives the same fleet.
+    let mut replayed = pitwall::Fleet::default();
+    for event in read_events(&file).expect("a good file") {
+        replayed.apply(&event.expect("a good event"));
+    }
+    for (car, live) in replayed.view(0).iter().zip(&live) {
+        assert_eq!(
+            (&car.car, &car.pose, &car.health, &car.set),
+            (&live.car, &live.pose, &live.health, &live.set)
+        );
+        assert_eq!(car.last_lap_s, live.last_lap_s);
+    }
+    assert_eq!(replayed.cars().count(), 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recording_that_was_cut_off_is_recovered() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("session.mcap");
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    hub.start_recording(&file).await.expect("a new file");
+    let poses = |hub: &Hub| {
+        let streams = hub.recording().expect("a recording").summary.streams;
+        streams
+            .iter()
+            .find(|s| s.topic == Topic::Pose)
+            .map_or(0, |s| s.gaps.received)
+    };
+    wait_until("a second of poses is in the file", || poses(&hub) > 40).await;
+    let on_disk = poses(&hub);
+    // What a power cut leaves behind: the file as it is now, without its end, and torn in its last record.
+    let mut bytes = std::fs::read(&file).expect("readable");
+    bytes.truncate(bytes.len() - 3);
+    let torn = folder.path().join("torn.mcap");
+    std::fs::write(&torn, bytes).expect("written");
+    drop(car);
+    hub.close().await;
+
+    assert!(
+        read_events(&torn).expect("opens").any(|event| event.is_err()),
+        "an unfinished file says so"
+    );
+    let mended = folder.path().join("mended.mcap");
+    let recovered = pitwall::recover(&torn, &mended).expect("something is left");
+    assert!(recovered.damage.is_some());
+    let events: Vec<_> = read_events(&mended)
+        .expect("opens")
+        .collect::<Result<_, _>>()
+        .expect("whole");
+    let poses = events
+        .iter()
+        .filter(|event| {
+            matches!(
+                event.happening,
+                pitwall::Happening::Message {
+                    topic: Topic::Pose,
+                    ..
+                }
+            )
+        })
+        .count() as u64;
+    assert!(
+        poses + 40 >= on_disk,
+        "{poses} of {on_disk} poses: more than a second is lost"
+    );
+    assert!(
+        pitwall::recover(&torn, &mended).is_err(),
+        "nothing is overwritten"
+    );
+}

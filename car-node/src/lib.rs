@@ -2,7 +2,22 @@
 //!
 //! The library holds the parts, the binary the commands. See [`evaluate`] for a filter over a recorded log.
 pub mod bag;
+pub mod clock;
+pub mod counters;
+pub mod desk;
 pub mod evaluate;
+pub mod filter;
 pub mod frames;
+pub mod health;
+pub mod keeper;
+pub mod laps;
+pub mod link;
+pub mod load;
+pub mod node;
+pub mod outbox;
+pub mod proposal;
+pub mod publisher;
 pub mod ros;
 pub mod sets;
+pub mod source;
+pub mod wire;

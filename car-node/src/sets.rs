@@ -1,7 +1,9 @@
 //! Parameter sets by name or from a file.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use serde_json::Value;
 use synpf::{ParameterFault, Parameters};
 
 /// A set as it was found.
@@ -69,6 +71,51 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
         parameters,
         unknown_keys,
     })
+}
+
+/// A set as flat keys and values.
+pub fn values(parameters: &Parameters) -> BTreeMap<String, Value> {
+    match serde_json::to_value(parameters) {
+        Ok(Value::Object(values)) => values.into_iter().collect(),
+        _ => BTreeMap::new(),
+    }
+}
+
+/// `base` with some values replaced. Refused whole, with every fault: a key that means nothing here is one.
+pub fn with_values(
+    base: &Parameters,
+    given: impl IntoIterator<Item = (String, Value)>,
+) -> Result<Parameters, Vec<ParameterFault>> {
+    let known = values(base);
+    let mut merged = known.clone();
+    let mut faults = Vec::new();
+    let read = |values: BTreeMap<String, Value>| {
+        serde_json::from_value::<Parameters>(Value::Object(values.into_iter().collect()))
+    };
+    for (key, value) in given {
+        let fault = if known.contains_key(&key) {
+            let mut alone = known.clone();
+            alone.insert(key.clone(), value.clone());
+            read(alone).err().map(|error| format!("{value}: {error}"))
+        } else {
+            Some("there is no such parameter".into())
+        };
+        match fault {
+            Some(fault) => faults.push(ParameterFault { key, fault }),
+            None => drop(merged.insert(key, value)),
+        }
+    }
+    if !faults.is_empty() {
+        return Err(faults);
+    }
+    let parameters = read(merged).map_err(|error| {
+        vec![ParameterFault {
+            key: "set".into(),
+            fault: error.to_string(),
+        }]
+    })?;
+    parameters.validate()?;
+    Ok(parameters)
 }
 
 #[cfg(test)]

@@ -7,10 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use car_node::bag::{Bag, SensorLog, Topics};
+use car_node::bag::SensorLog;
 use car_node::evaluate::{ErrorSummary, Outcome, Start, Truth, run as run_over};
-use car_node::frames::Mount;
-use car_node::sets::{self, NamedSet};
+use car_node::sets::NamedSet;
 use indicatif::{ProgressBar, ProgressStyle};
 use maps::OccupancyGrid;
 use serde::Serialize;
@@ -42,14 +41,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     if arguments.poses.is_some() && arguments.bag.len() * arguments.seed.len() > 1 {
         bail!("--poses takes the poses of one run: give one --bag and one --seed");
     }
-    let set = sets::load(&arguments.params)?;
-    if !set.unknown_keys.is_empty() {
-        eprintln!(
-            "car-node: warning: {}: keys that mean nothing here: {}",
-            arguments.params,
-            set.unknown_keys.join(", ")
-        );
-    }
+    let set = super::load_set(&arguments.params)?;
     let grid = OccupancyGrid::load(&arguments.map)?;
     let before = Instant::now();
     let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
@@ -60,7 +52,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
 
     let mut reports = Vec::new();
     for bag in &arguments.bag {
-        let log = read(bag, arguments)?;
+        let log = super::read_bag(bag, &arguments.topics)?;
         let truth = Truth::new(log.truth.clone());
         for &seed in &arguments.seed {
             let outcome = over_bag(arguments, &map, &set, bag, &log, &truth, seed)
@@ -84,16 +76,6 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn read(bag: &Path, arguments: &Evaluate) -> anyhow::Result<SensorLog> {
-    let topics = Topics {
-        scan: arguments.scan_topic.clone(),
-        odometry: arguments.odom_topic.clone(),
-        truth: arguments.truth_topic.clone(),
-        imu: arguments.imu_topic.clone(),
-    };
-    Ok(Bag::read(bag)?.sensors(&topics, arguments.laser.map(Mount::upright))?)
-}
-
 fn over_bag(
     arguments: &Evaluate,
     map: &Arc<TrackMap>,
@@ -103,15 +85,7 @@ fn over_bag(
     truth: &Truth,
     seed: u64,
 ) -> anyhow::Result<Outcome> {
-    let mount = log.mount.unwrap_or_else(|| {
-        let typical = Mount::typical();
-        eprintln!(
-            "car-node: warning: {}: no /tf_static; laser assumed {} m ahead of base_link (--laser says otherwise)",
-            bag.display(),
-            typical.base_link_from_laser.x
-        );
-        typical
-    });
+    let mount = super::mount(bag, log);
     let mut localizer = Localizer::new(
         Arc::clone(map),
         mount.base_link_from_laser,

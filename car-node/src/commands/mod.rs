@@ -6,6 +6,51 @@
 )]
 
 pub(crate) mod evaluate;
+pub(crate) mod run;
+
+use std::path::Path;
+
+use car_node::bag::{Bag, SensorLog, Topics};
+use car_node::frames::Mount;
+use car_node::sets::{self, NamedSet};
+
+use crate::cli::TopicArguments;
+
+/// Reads what a localizer needs of a bag.
+fn read_bag(bag: &Path, arguments: &TopicArguments) -> anyhow::Result<SensorLog> {
+    let topics = Topics {
+        scan: arguments.scan_topic.clone(),
+        odometry: arguments.odom_topic.clone(),
+        truth: arguments.truth_topic.clone(),
+        imu: arguments.imu_topic.clone(),
+    };
+    Ok(Bag::read(bag)?.sensors(&topics, arguments.laser.map(Mount::upright))?)
+}
+
+/// Where the laser is, with a warning when that is a guess.
+fn mount(bag: &Path, log: &SensorLog) -> Mount {
+    log.mount.unwrap_or_else(|| {
+        let typical = Mount::typical();
+        eprintln!(
+            "car-node: warning: {}: no /tf_static; laser assumed {} m ahead of base_link (--laser says otherwise)",
+            bag.display(),
+            typical.base_link_from_laser.x
+        );
+        typical
+    })
+}
+
+/// A parameter set, with a warning that lists the keys that mean nothing.
+fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
+    let set = sets::load(name_or_path)?;
+    if !set.unknown_keys.is_empty() {
+        eprintln!(
+            "car-node: warning: {name_or_path}: keys that mean nothing here: {}",
+            set.unknown_keys.join(", ")
+        );
+    }
+    Ok(set)
+}
 
 /// Says why a command failed: each cause once, though some libraries repeat their source's words in their own.
 pub(crate) fn complain(error: &anyhow::Error) {

@@ -1,0 +1,168 @@
+//! `car-node run`.
+
+use std::env;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::source::{BagPlayer, Race, Source};
+use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
+use maps::{OccupancyGrid, Raceline};
+use simulator::{CarSetup, Grip, OdometryParams, Track, YawSource};
+use synpf::TrackMap;
+
+use crate::cli::{Odometry, Run, SourceKind};
+
+/// After the last message of a bag: time for the pit wall to fetch what it has missed.
+const LINGER: Duration = Duration::from_secs(1);
+
+pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
+    let signal = signals()?;
+    let (map, source, begin): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
+        (SourceKind::Bag, Some(bag)) => {
+            let mut log = super::read_bag(bag, &arguments.topics)?;
+            log.mount = Some(super::mount(bag, &log));
+            let player = BagPlayer::new(bag.clone(), log);
+            (map_of_bag(arguments)?, Box::new(player), Begin::Global)
+        }
+        (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
+        (SourceKind::Simulator, _) => {
+            let track = Track::load(&arguments.map)?;
+            let map = race_map(
+                track.name.clone(),
+                track.grid.clone(),
+                Some(track.raceline.clone()),
+            )?;
+            let race = Race::new(track, vec![setup(arguments.odometry)], arguments.seed, Vec::new());
+            (map, Box::new(race.car(0)), Begin::Source)
+        }
+    };
+    let description = source.description();
+    let mut config = NodeConfig::new(arguments.car.clone(), map, source);
+    config.set = arguments.params.as_deref().map(super::load_set).transpose()?;
+    config.begin = arguments.initial_pose.unwrap_or(begin);
+    config.seed = arguments.seed;
+    config.rate = arguments.rate;
+    config.connect.clone_from(&arguments.connect);
+    config.rates.recorded = !arguments.no_recorded;
+    config.predict = arguments.predict;
+    config.state = arguments
+        .state
+        .clone()
+        .or_else(|| default_state_folder(arguments.car.as_str()));
+    let node = Node::start(config)?;
+    let wall = if arguments.connect.is_empty() {
+        "a pit wall on this machine or nearby".to_owned()
+    } else {
+        arguments.connect.join(", ")
+    };
+    eprintln!("{}: {description}; dials {wall}. Ctrl-C ends it.", arguments.car);
+    let reason = wait(&node, &signal, arguments.stay);
+    let belief = *node
+        .shared()
+        .belief
+        .lock()
+        .unwrap_or_else(std::sync::PoisonError::into_inner);
+    node.shutdown(reason);
+    match belief {
+        Some(belief) => eprintln!(
+            "{}: {reason}; last at {:.2}, {:.2} m, {:.1} deg.",
+            arguments.car,
+            belief.pose.x,
+            belief.pose.y,
+            belief.pose.heading.to_degrees()
+        ),
+        None => eprintln!("{}: {reason}; never had a pose.", arguments.car),
+    }
+    Ok(())
+}
+
+/// Waits for whatever ends the node first, and says what that was.
+fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static str {
+    let mut ended = None;
+    loop {
+        match signal.recv_timeout(Duration::from_millis(50)) {
+            Ok(reason) => return reason,
+            Err(RecvTimeoutError::Disconnected) => return "signals are gone",
+            Err(RecvTimeoutError::Timeout) => {}
+        }
+        if !stay && node.source_ended() && ended.get_or_insert_with(Instant::now).elapsed() > LINGER {
+            return "end of the bag";
+        }
+    }
+}
+
+/// The name of the signal that ends the node, when it comes.
+fn signals() -> anyhow::Result<Receiver<&'static str>> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()?;
+    let (tell, told) = bounded(1);
+    std::thread::Builder::new()
+        .name("signals".into())
+        .spawn(move || {
+            let reason = runtime.block_on(async {
+                let Ok(mut terminate) =
+                    tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())
+                else {
+                    return "signals are gone";
+                };
+                tokio::select! {
+                    _ = tokio::signal::ctrl_c() => "interrupted",
+                    _ = terminate.recv() => "terminated",
+                }
+            });
+            tell.send(reason).ok();
+        })?;
+    Ok(told)
+}
+
+fn map_of_bag(arguments: &Run) -> anyhow::Result<RaceMap> {
+    let grid = OccupancyGrid::load(&arguments.map)?;
+    let beside = arguments.map.with_file_name("raceline.csv");
+    let raceline = match &arguments.raceline {
+        Some(path) => Some(Raceline::load(path)?),
+        None if beside.exists() => Some(Raceline::load(beside)?),
+        None => None,
+    };
+    // A map is called by its folder when its file is only called map.
+    let stem = arguments.map.file_stem().unwrap_or_default().to_string_lossy();
+    let folder = arguments.map.parent().and_then(Path::file_name);
+    let name = match folder {
+        Some(folder) if stem == "map" => folder.to_string_lossy(),
+        _ => stem,
+    };
+    race_map(name.into_owned(), grid, raceline).with_context(|| arguments.map.display().to_string())
+}
+
+fn race_map(name: String, grid: OccupancyGrid, raceline: Option<Raceline>) -> anyhow::Result<RaceMap> {
+    Ok(RaceMap {
+        name,
+        map: Arc::new(TrackMap::new(grid)?),
+        raceline: raceline.map(Arc::new),
+    })
+}
+
+/// The simulated car: on taped tyres its odometry knows its turning from the steering alone.
+fn setup(odometry: Odometry) -> CarSetup {
+    let mut setup = CarSetup::default();
+    if odometry == Odometry::Lq {
+        setup.vehicle = setup.vehicle.with_grip(Grip::LQ);
+        setup.odometry = OdometryParams {
+            yaw_source: YawSource::Steering,
+            ..setup.odometry
+        };
+    }
+    setup
+}
+
+/// `$XDG_STATE_HOME/synpf/<car>`, by default in `~/.local/state`; None for a user without a home.
+fn default_state_folder(car: &str) -> Option<PathBuf> {
+    let base = env::var_os("XDG_STATE_HOME")
+        .filter(|folder| !folder.is_empty())
+        .map(PathBuf::from)
+        .or_else(|| Some(PathBuf::from(env::var_os("HOME")?).join(".local/state")))?;
+    Some(base.join("synpf").join(car))
+}

@@ -1,0 +1,446 @@
+//! The thread that takes commands and questions: it decides, has the filter do it, and answers.
+//!
+//! ```text
+//! query --> known id? the same answer again
+//!           payload broken? refused, counted
+//!           sets: keeper plans --> filter swaps between two updates --> keeper commits --> file, event, answer
+//!           pose, search: filter does it --> event, answer
+//! ```
+
+mod answers;
+mod file;
+
+use std::sync::{Arc, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, Sender, bounded, select};
+use protocol::{
+    Action, Answer, Command, CommandId, EventKind, Outcome, ParamsAction, RatesAction, RelocalizeAction,
+    Reply, Stamps, Topic, decode, encode,
+};
+use zenoh::Wait;
+use zenoh::query::Query;
+
+use self::answers::Answers;
+pub use self::file::{FileError, StateFile};
+use crate::clock::{SensorClock, wall_now};
+use crate::filter::{Order, Shared};
+use crate::keeper::{Decision, Keeper, Plan, Refusal};
+use crate::outbox::Record;
+use crate::wire;
+
+/// The filter looks at orders between two messages; longer than this and it hangs.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// The set in force is told this often, change or not.
+const PARAMS_PERIOD: Duration = Duration::from_secs(1);
+/// Deadlines and proposals are looked at this often.
+const TICK: Duration = Duration::from_millis(50);
+/// After a switch by itself, the car keeps that set at least this long.
+const AUTO_HOLD: Duration = Duration::from_secs(10);
+/// Who switches when the car does it by itself.
+const AUTO: &str = "auto";
+
+/// What is asked of the car, with the way to answer.
+#[derive(Debug)]
+pub struct Inquiry {
+    /// Under which topic it came.
+    pub topic: Topic,
+    /// The question itself.
+    pub query: Query,
+}
+
+/// Everything that the thread owns.
+pub struct Desk {
+    /// The sets.
+    pub keeper: Keeper,
+    /// Where they are kept over a restart.
+    pub file: Option<StateFile>,
+    /// Orders to the filter.
+    pub orders: Sender<Order>,
+    /// What goes out.
+    pub shared: Arc<Shared>,
+    /// The sensors' time, for events.
+    pub clock: SensorClock,
+    /// This run of the node.
+    pub session_number: u64,
+    /// The answer to `map`, encoded.
+    pub map: Vec<u8>,
+    /// The answer to `info`, encoded.
+    pub info: Vec<u8>,
+}
+
+/// The loop's own state beside the desk's.
+struct Loop {
+    desk: Desk,
+    answers: Answers,
+    sequence: u64,
+    update: u64,
+    params_due: Instant,
+    auto_rests_until: Option<Instant>,
+}
+
+/// Starts the thread. It ends when `stop` is dropped.
+pub fn start(
+    desk: Desk,
+    inquiries: Receiver<Inquiry>,
+    stop: Receiver<()>,
+) -> std::io::Result<JoinHandle<()>> {
+    thread::Builder::new().name("desk".into()).spawn(move || {
+        let mut desk = Loop {
+            desk,
+            answers: Answers::default(),
+            sequence: 0,
+            update: 0,
+            params_due: Instant::now(),
+            auto_rests_until: None,
+        };
+        desk.save();
+        loop {
+            select! {
+                recv(stop) -> _ => return,
+                recv(inquiries) -> inquiry => match inquiry {
+                    Ok(inquiry) => desk.serve(&inquiry),
+                    Err(_) => return,
+                },
+                default(TICK) => {}
+            }
+            desk.look_at_the_clock();
+        }
+    })
+}
+
+impl Loop {
+    fn serve(&mut self, inquiry: &Inquiry) {
+        let bytes = match inquiry.topic {
+            Topic::Map => self.desk.map.clone(),
+            Topic::Info => self.desk.info.clone(),
+            _ => match self.command(inquiry) {
+                Ok(bytes) => bytes,
+                Err(error) => {
+                    let count = self.desk.shared.counters.bad_payload() + 1;
+                    if count.is_power_of_two() {
+                        tracing::warn!(topic = %inquiry.topic, count, error, "a command cannot be read");
+                    }
+                    if let Err(error) = inquiry.query.reply_err(error).wait() {
+                        tracing::debug!(%error, "nobody to answer");
+                    }
+                    return;
+                }
+            },
+        };
+        let key = inquiry.query.key_expr().clone();
+        if let Err(error) = inquiry.query.reply(key, bytes).wait() {
+            // Whoever asked sees that no answer came, and asks again under the same id.
+            tracing::debug!(%error, "nobody to answer");
+        }
+    }
+
+    /// Reads a command, does it, and gives the answer's bytes.
+    fn command(&mut self, inquiry: &Inquiry) -> Result<Vec<u8>, String> {
+        // One command is for one car: a wildcard would switch the whole field.
+        if inquiry.query.key_expr().is_wild() {
+            return Err("a command needs one car's key, without wildcards".into());
+        }
+        let payload = inquiry.query.payload().ok_or("a command needs a payload")?;
+        let (_, command) = decode::<Command>(&payload.to_bytes()).map_err(|error| error.to_string())?;
+        let belongs = command.action.topic();
+        if belongs != inquiry.topic {
+            return Err(format!(
+                "this command goes under {belongs}, not {}",
+                inquiry.topic
+            ));
+        }
+        let answer = match self.answers.find(command.id) {
+            Some(answer) => answer.clone(),
+            None => self.obey(&command),
+        };
+        let stamps = Stamps {
+            session: self.desk.session_number,
+            sequence: self.sequence + 1,
+            sensor: wall_now().0,
+            published: wall_now().0,
+        };
+        self.sequence += 1;
+        encode(&answer, stamps).map_err(|error| error.to_string())
+    }
+
+    /// Does a command that was not done before, and remembers the answer.
+    fn obey(&mut self, command: &Command) -> Answer {
+        let outcome = match &command.action {
+            Action::Params(action) => self.about_sets(command, action),
+            Action::Pose(_) | Action::Relocalize(_) | Action::Rates(_) | Action::Auto(_)
+                if command
+                    .expected_revision
+                    .is_some_and(|expected| expected != self.desk.keeper.reference().revision) =>
+            {
+                self.stale(command.expected_revision.unwrap_or_default())
+            }
+            Action::Pose(pose) => self.initialize(command, wire::pose(*pose)),
+            Action::Relocalize(action) => self.relocalize(command, *action),
+            Action::Rates(action) => self.about_rates(command, action),
+            Action::Auto(on) => self.set_auto(command, *on),
+        };
+        if let Outcome::Refused { faults } = &outcome {
+            let faults = faults.clone();
+            self.event(EventKind::CommandRefused { faults }, Some(command));
+        }
+        let answer = Answer {
+            id: command.id,
+            outcome,
+            set: self.desk.keeper.reference(),
+        };
+        self.answers.remember(answer.clone());
+        answer
+    }
+
+    fn about_sets(&mut self, command: &Command, action: &ParamsAction) -> Outcome {
+        match self.desk.keeper.plan(action, command.expected_revision) {
+            Err(Refusal::Stale { expected }) => self.stale(expected),
+            Err(Refusal::Faults(faults)) => Outcome::Refused { faults },
+            Ok(Decision::Sets(sets)) => done(None, Reply::Sets(sets)),
+            Ok(Decision::Confirmed) => {
+                let set = self.desk.keeper.reference();
+                self.event(EventKind::ParametersConfirmed { set }, Some(command));
+                self.save();
+                self.tell_params();
+                done(None, Reply::Nothing)
+            }
+            Ok(Decision::Deleted(name)) => {
+                self.event(EventKind::SetDeleted { name }, Some(command));
+                self.save();
+                self.tell_params();
+                done(None, Reply::Nothing)
+            }
+            Ok(Decision::Change(plan)) => match self.change(plan, &command.operator, Some(command.id)) {
+                Ok(update) => done(Some(update), Reply::Nothing),
+                Err(faults) => Outcome::Refused { faults },
+            },
+        }
+    }
+
+    /// Stores, swaps, commits, tells: in this order, so that whatever goes wrong, what was in force stays so.
+    fn change(&mut self, plan: Plan, who: &str, command: Option<CommandId>) -> Result<u64, Vec<String>> {
+        let replaced = plan.store.then(|| self.desk.keeper.store(&plan, who));
+        let taken = self.write_memory().and_then(|()| self.swap(&plan));
+        let update = match taken {
+            Ok(update) => update,
+            Err(faults) => {
+                if let Some(replaced) = replaced {
+                    self.desk.keeper.unstore(&plan.name, replaced);
+                    self.save();
+                }
+                return Err(faults);
+            }
+        };
+        self.update = update.saturating_sub(1);
+        let revert_after = plan.revert_after;
+        let stored = plan.store.then(|| plan.name.clone());
+        let falls_back = who == FALL_BACK;
+        let now = wall_now();
+        let from = self.desk.keeper.commit(plan, who, now, update);
+        let to = self.desk.keeper.reference();
+        if let Some(name) = stored {
+            self.event_by(EventKind::SetStored { name }, Some(who), command);
+        }
+        let kind = if falls_back {
+            EventKind::ParametersFellBack { from, to, update }
+        } else {
+            EventKind::ParametersChanged {
+                from,
+                to,
+                update,
+                revert_after: revert_after.map(|seconds| seconds as f32),
+            }
+        };
+        self.event_by(kind, (!falls_back).then_some(who), command);
+        self.save();
+        self.tell_params();
+        Ok(update)
+    }
+
+    fn swap(&self, plan: &Plan) -> Result<u64, Vec<String>> {
+        let (answer, answered) = bounded(1);
+        let order = Order::SetParameters {
+            name: plan.name.clone(),
+            parameters: Box::new(plan.parameters.clone()),
+            answer,
+        };
+        self.order(order, &answered)
+            .map_err(|fault| vec![fault])?
+            .map_err(|faults| faults.iter().map(ToString::to_string).collect())
+    }
+
+    /// Gives the filter an order and waits for its answer.
+    fn order<T>(&self, order: Order, answered: &Receiver<T>) -> Result<T, String> {
+        self.desk
+            .orders
+            .send_timeout(order, PATIENCE)
+            .map_err(|_| "the filter takes no orders".to_owned())?;
+        answered
+            .recv_timeout(PATIENCE)
+            .map_err(|_| format!("the filter did not answer within {} s", PATIENCE.as_secs()))
+    }
+
+    fn initialize(&mut self, command: &Command, pose: maps::Pose) -> Outcome {
+        let (answer, answered) = bounded(1);
+        match self
+            .order(Order::Initialize { pose, answer }, &answered)
+            .and_then(|taken| taken)
+        {
+            Ok(update) => {
+                let pose = wire::pose2(pose);
+                self.event(EventKind::PoseInitialized { pose }, Some(command));
+                done(Some(update), Reply::Nothing)
+            }
+            Err(fault) => refused(fault),
+        }
+    }
+
+    fn relocalize(&mut self, command: &Command, action: RelocalizeAction) -> Outcome {
+        match action {
+            RelocalizeAction::Search => {
+                let (answer, answered) = bounded(1);
+                match self.order(Order::Relocalize { answer }, &answered) {
+                    Ok(update) => {
+                        self.event(EventKind::SearchStarted, Some(command));
+                        done(Some(update), Reply::Nothing)
+                    }
+                    Err(fault) => refused(fault),
+                }
+            }
+            RelocalizeAction::Pick { candidate } => {
+                refused(format!("no search has left a candidate {candidate}"))
+            }
+        }
+    }
+
+    fn about_rates(&mut self, command: &Command, action: &RatesAction) -> Outcome {
+        let mut rates = self
+            .desk
+            .shared
+            .rates
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        if let RatesAction::Set(wanted) = action {
+            *rates = *wanted;
+        }
+        let now = *rates;
+        drop(rates);
+        if matches!(action, RatesAction::Set(_)) {
+            self.event(EventKind::RatesChanged, Some(command));
+        }
+        done(None, Reply::Rates(now))
+    }
+
+    fn set_auto(&mut self, command: &Command, on: bool) -> Outcome {
+        self.desk
+            .shared
+            .advice
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .auto = on;
+        self.event(EventKind::AutoChanged { on }, Some(command));
+        done(None, Reply::Nothing)
+    }
+
+    fn stale(&self, expected: u64) -> Outcome {
+        Outcome::StaleRevision {
+            expected,
+            who: self.desk.keeper.in_force().who.clone(),
+        }
+    }
+
+    /// Falls back where nobody confirmed, switches where the car may, and tells the set in force.
+    fn look_at_the_clock(&mut self) {
+        if let Some(plan) = self.desk.keeper.fall_back(wall_now()) {
+            let name = plan.name.clone();
+            if let Err(faults) = self.change(plan, FALL_BACK, None) {
+                let text = format!("cannot fall back to {name}: {}", faults.join("; "));
+                self.event_by(EventKind::Error { text }, None, None);
+            }
+        }
+        self.follow_proposal();
+        if Instant::now() >= self.params_due {
+            self.tell_params();
+        }
+    }
+
+    fn follow_proposal(&mut self) {
+        let resting = self.auto_rests_until.is_some_and(|until| Instant::now() < until);
+        // A trial is somebody's experiment: hands off until it is over.
+        if resting || self.desk.keeper.falls_back_at().is_some() {
+            return;
+        }
+        let advice = self
+            .desk
+            .shared
+            .advice
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone();
+        let Some(proposal) = advice.proposal.filter(|_| advice.auto) else {
+            return;
+        };
+        if proposal.set == self.desk.keeper.in_force().name {
+            return;
+        }
+        self.auto_rests_until = Some(Instant::now() + AUTO_HOLD);
+        let action = ParamsAction::Select {
+            name: proposal.set,
+            revert_after_ms: None,
+        };
+        if let Ok(Decision::Change(plan)) = self.desk.keeper.plan(&action, None)
+            && let Err(faults) = self.change(plan, AUTO, None)
+        {
+            let text = format!("cannot switch: {}", faults.join("; "));
+            self.event_by(EventKind::Error { text }, Some(AUTO), None);
+        }
+    }
+
+    fn tell_params(&mut self) {
+        self.params_due = Instant::now() + PARAMS_PERIOD;
+        let params = self.desk.keeper.params();
+        self.desk.shared.outbox.record(Record::Params(Box::new(params)));
+    }
+
+    fn event(&self, kind: EventKind, command: Option<&Command>) {
+        self.event_by(
+            kind,
+            command.map(|command| command.operator.as_str()),
+            command.map(|command| command.id),
+        );
+    }
+
+    fn event_by(&self, kind: EventKind, who: Option<&str>, command: Option<CommandId>) {
+        self.desk
+            .shared
+            .event(self.desk.clock.now(), self.update, kind, who, command);
+    }
+
+    /// Writes the memory to its file; the set is not worth losing over a full disk, so that this only warns.
+    fn save(&self) {
+        if let Err(faults) = self.write_memory() {
+            let text = faults.join("; ");
+            self.event_by(EventKind::Error { text }, None, None);
+        }
+    }
+
+    fn write_memory(&self) -> Result<(), Vec<String>> {
+        self.desk.file.as_ref().map_or(Ok(()), |file| {
+            file.write(self.desk.keeper.memory())
+                .map_err(|error| vec![error.to_string()])
+        })
+    }
+}
+
+/// Who puts a set back in force when nobody confirmed.
+const FALL_BACK: &str = "fall-back";
+
+fn done(update: Option<u64>, reply: Reply) -> Outcome {
+    Outcome::Done { update, reply }
+}
+
+fn refused(fault: String) -> Outcome {
+    Outcome::Refused { faults: vec![fault] }
+}

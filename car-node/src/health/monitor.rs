@@ -1,0 +1,533 @@
+//! The state machine.
+
+use std::collections::{HashMap, VecDeque};
+
+use maps::Pose;
+use serde::Serialize;
+use synpf::{Mode, Stamp, Update};
+
+use super::rules::{Family, Finding, findings};
+use super::{Cause, CauseKind, Metrics, Severity, Thresholds};
+use crate::evaluate::percentile;
+
+/// What the car knows of its own pose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// No pose yet.
+    Init,
+    /// A pose, not yet confirmed.
+    Converging,
+    /// The pose can be raced on.
+    Localized,
+    /// The pose is probably right; something is wrong.
+    Degraded,
+    /// The pose is wrong.
+    Lost,
+    /// Searching the whole map.
+    Relocalizing,
+    /// No sensor data.
+    Stale,
+}
+
+/// The state, with all that led to it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Verdict {
+    /// The state.
+    pub state: State,
+    /// When it was entered, on the sensors' clock.
+    pub since: Stamp,
+    /// Why, the worst first; empty when all is well.
+    pub causes: Vec<Cause>,
+    /// The last update; 0 before the first.
+    pub update: u64,
+    /// What was measured at it; None before the first.
+    pub metrics: Option<Metrics>,
+}
+
+/// Ages of poses are summarised over this long [s].
+const AGE_WINDOW: f64 = 1.0;
+
+/// Follows one localizer.
+#[derive(Debug)]
+pub struct Monitor {
+    thresholds: Thresholds,
+    verdict: Verdict,
+    last_scan: Option<Stamp>,
+    last_odometry: Option<Stamp>,
+    /// Findings of the last update.
+    findings: Vec<Finding>,
+    /// For how many scans on end each kind was found.
+    streaks: HashMap<CauseKind, u32>,
+    /// Since when each family has said that the pose is wrong.
+    lost_since: [Option<Stamp>; Family::COUNT],
+    /// Since when nothing has been wrong.
+    good_since: Option<Stamp>,
+    /// Driven since the state was entered [m].
+    driven: f64,
+    last_pose: Option<(Stamp, Pose)>,
+    /// Scans refused in a row.
+    refused: u32,
+    ages: VecDeque<(Stamp, f64)>,
+    /// Where STALE goes back to.
+    before_stale: State,
+}
+
+impl Monitor {
+    /// A monitor of a localizer that has no pose yet. `now` is on the sensors' clock.
+    pub fn new(thresholds: Thresholds, now: Stamp) -> Self {
+        Self {
+            thresholds,
+            verdict: Verdict {
+                state: State::Init,
+                since: now,
+                causes: Vec::new(),
+                update: 0,
+                metrics: None,
+            },
+            last_scan: None,
+            last_odometry: None,
+            findings: Vec::new(),
+            streaks: HashMap::new(),
+            lost_since: [None; Family::COUNT],
+            good_since: None,
+            driven: 0.0,
+            last_pose: None,
+            refused: 0,
+            ages: VecDeque::new(),
+            before_stale: State::Init,
+        }
+    }
+
+    /// The limits in force.
+    pub fn thresholds(&self) -> &Thresholds {
+        &self.thresholds
+    }
+
+    /// The latest verdict.
+    pub fn verdict(&self) -> &Verdict {
+        &self.verdict
+    }
+
+    /// Odometry has come in, at `now`.
+    pub fn on_odometry(&mut self, now: Stamp) {
+        self.last_odometry = Some(now);
+    }
+
+    /// A scan has come in at `now` and was refused.
+    pub fn on_refused_scan(&mut self, now: Stamp) {
+        self.last_scan = Some(now);
+        self.refused = self.refused.saturating_add(1);
+    }
+
+    /// The localizer was given a new pose.
+    pub fn on_new_pose(&mut self, now: Stamp) {
+        self.last_pose = None;
+        self.enter(State::Converging, now);
+    }
+
+    /// A search of the whole map has begun.
+    pub fn on_search(&mut self, now: Stamp) {
+        self.last_pose = None;
+        self.enter(State::Relocalizing, now);
+    }
+
+    /// A scan has come in and led to an update; its pose was ready at `now`.
+    pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
+        self.last_scan = Some(now);
+        self.refused = 0;
+        let raw = Metrics::of(update);
+        let smoothed = self.smooth(raw, update.stamp, now);
+        self.findings = findings(&raw, &smoothed, &self.thresholds);
+        self.count(update.stamp);
+        if let Some((_, pose)) = self.last_pose {
+            self.driven += pose.distance(update.pose);
+        }
+        self.last_pose = Some((update.stamp, update.pose));
+        self.verdict.update = update.number;
+        self.verdict.metrics = Some(smoothed);
+        self.advance(update.mode, update.stamp, now);
+        self.tick(now)
+    }
+
+    /// Looks at the clock: without data, the state becomes STALE. Also renews the causes.
+    pub fn tick(&mut self, now: Stamp) -> &Verdict {
+        let missing = self.missing(now);
+        let stale = self.verdict.state == State::Stale;
+        if !missing.is_empty() && !stale && self.verdict.state != State::Init {
+            self.before_stale = self.verdict.state;
+            self.enter(State::Stale, now);
+        } else if missing.is_empty() && stale {
+            // Odometry has carried a tracked pose across the gap; anything else starts again.
+            let tracked = matches!(self.before_stale, State::Localized | State::Degraded);
+            self.enter(
+                if tracked {
+                    State::Degraded
+                } else {
+                    State::Converging
+                },
+                now,
+            );
+        }
+        self.verdict.causes = self.causes(missing);
+        &self.verdict
+    }
+
+    fn enter(&mut self, state: State, now: Stamp) {
+        if self.verdict.state != state {
+            self.verdict.state = state;
+            self.verdict.since = now;
+        }
+        self.driven = 0.0;
+        self.good_since = None;
+        self.lost_since = [None; Family::COUNT];
+    }
+
+    fn smooth(&mut self, raw: Metrics, stamp: Stamp, now: Stamp) -> Metrics {
+        let mut smoothed = raw;
+        if let (Some(previous), Some((last, _))) = (self.verdict.metrics, self.last_pose) {
+            let share = 1.0 - (-stamp.since(last).max(0.0) / self.thresholds.smoothing).exp();
+            let step = |from: f64, to: f64| from + share * (to - from);
+            smoothed.alignment = step(previous.alignment, raw.alignment);
+            smoothed.residual = step(previous.residual, raw.residual);
+        }
+        self.ages.push_back((now, now.since(stamp)));
+        while self
+            .ages
+            .front()
+            .is_some_and(|(at, _)| now.since(*at) > AGE_WINDOW)
+        {
+            self.ages.pop_front();
+        }
+        let ages: Vec<f64> = self.ages.iter().map(|(_, age)| *age).collect();
+        smoothed.age_p50 = percentile(&ages, 0.5).unwrap_or_default();
+        smoothed.age_p99 = percentile(&ages, 0.99).unwrap_or_default();
+        smoothed
+    }
+
+    /// Counts scans on end, and since when families have spoken and when nothing has been wrong.
+    fn count(&mut self, stamp: Stamp) {
+        let findings = &self.findings;
+        self.streaks
+            .retain(|kind, _| findings.iter().any(|finding| finding.kind == *kind));
+        for finding in findings {
+            *self.streaks.entry(finding.kind).or_default() += 1;
+        }
+        for family in [
+            Family::EndPoints,
+            Family::LongBeams,
+            Family::Likelihood,
+            Family::Particles,
+        ] {
+            let since = &mut self.lost_since[family as usize];
+            if findings.iter().any(|finding| finding.lost == Some(family)) {
+                since.get_or_insert(stamp);
+            } else {
+                *since = None;
+            }
+        }
+        if findings.iter().any(|finding| finding.degrades) {
+            self.good_since = None;
+        } else {
+            self.good_since.get_or_insert(stamp);
+        }
+    }
+
+    fn advance(&mut self, mode: Mode, stamp: Stamp, now: Stamp) {
+        let t = self.thresholds;
+        let good = self
+            .good_since
+            .is_some_and(|since| stamp.since(since) >= t.good_for);
+        let lost = self
+            .lost_since
+            .iter()
+            .flatten()
+            .filter(|since| stamp.since(**since) >= t.lost_after)
+            .count()
+            >= 2;
+        let degraded = self.findings.iter().any(|finding| self.lasting(finding));
+        let next = match (self.verdict.state, mode) {
+            (State::Stale, _) => return,
+            (_, Mode::Searching) => State::Relocalizing,
+            (_, Mode::Uninitialized) => State::Init,
+            (State::Init | State::Relocalizing, Mode::Tracking) => State::Converging,
+            (State::Converging | State::Localized | State::Degraded, _) if lost => State::Lost,
+            (State::Converging, _) if good && self.driven >= t.confirmed_after => State::Localized,
+            (State::Localized, _) if degraded => State::Degraded,
+            (State::Degraded, _) if good => State::Localized,
+            (State::Lost, _) if good => State::Converging,
+            (state, _) => state,
+        };
+        if next != self.verdict.state {
+            self.enter(next, now);
+        }
+    }
+
+    /// True for a finding that has lasted long enough to degrade the state.
+    fn lasting(&self, finding: &Finding) -> bool {
+        finding.degrades
+            && self
+                .streaks
+                .get(&finding.kind)
+                .is_some_and(|scans| *scans >= self.thresholds.bad_scans)
+    }
+
+    /// Which sensors are silent, with the time since they last spoke [s].
+    fn missing(&self, now: Stamp) -> Vec<(CauseKind, f64)> {
+        let silent = |last: Option<Stamp>| {
+            let silence = now.since(last.unwrap_or(self.verdict.since));
+            (silence > self.thresholds.stale_after).then_some(silence)
+        };
+        [
+            (CauseKind::NoScan, silent(self.last_scan)),
+            (CauseKind::NoOdometry, silent(self.last_odometry)),
+        ]
+        .into_iter()
+        .filter_map(|(kind, silence)| Some((kind, silence?)))
+        .collect()
+    }
+
+    fn causes(&self, missing: Vec<(CauseKind, f64)>) -> Vec<Cause> {
+        let plain = |kind, severity| Cause {
+            kind,
+            severity,
+            value: None,
+            limit: None,
+        };
+        let mut causes: Vec<Cause> = missing
+            .into_iter()
+            .map(|(kind, silence)| Cause {
+                kind,
+                severity: Severity::Critical,
+                value: Some(silence),
+                limit: Some(self.thresholds.stale_after),
+            })
+            .collect();
+        match self.verdict.state {
+            State::Init => causes.push(plain(CauseKind::NoInitialPose, Severity::Warning)),
+            State::Converging => causes.push(plain(CauseKind::NewPose, Severity::Info)),
+            State::Relocalizing => causes.push(plain(CauseKind::Searching, Severity::Warning)),
+            State::Localized | State::Degraded | State::Lost | State::Stale => {}
+        }
+        if self.refused >= self.thresholds.bad_scans && self.verdict.state != State::Init {
+            causes.push(plain(CauseKind::BadSensorData, Severity::Warning));
+        }
+        causes.extend(
+            self.findings
+                .iter()
+                .filter(|finding| !finding.degrades || self.lasting(finding))
+                .map(|finding| Cause {
+                    kind: finding.kind,
+                    severity: finding.severity,
+                    value: Some(finding.value),
+                    limit: Some(finding.limit),
+                }),
+        );
+        causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
+        causes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::health::tests_support::good_update;
+
+    const SCAN: f64 = 0.025;
+
+    /// A drive at 2 m/s, scan by scan.
+    struct Drive {
+        monitor: Monitor,
+        now: Stamp,
+        number: u64,
+    }
+
+    impl Drive {
+        fn new() -> Self {
+            let now = Stamp(1_000_000_000);
+            Self {
+                monitor: Monitor::new(Thresholds::default(), now),
+                now,
+                number: 0,
+            }
+        }
+
+        fn update(&mut self) -> Update {
+            self.number += 1;
+            Update {
+                pose: Pose::new(self.number as f64 * 2.0 * SCAN, 0.0, 0.0),
+                ..good_update(self.now, self.number)
+            }
+        }
+
+        /// Drives for some seconds on updates changed by `change`; the states on the way.
+        fn drive(&mut self, seconds: f64, change: impl Fn(&mut Update)) -> Vec<State> {
+            let mut states = vec![self.monitor.verdict().state];
+            for _ in 0..(seconds / SCAN).round() as usize {
+                self.now = self.now.plus(SCAN);
+                self.monitor.on_odometry(self.now);
+                let mut update = self.update();
+                change(&mut update);
+                let state = self.monitor.on_update(&update, self.now.plus(0.02)).state;
+                if states.last() != Some(&state) {
+                    states.push(state);
+                }
+            }
+            states
+        }
+
+        fn localized() -> Self {
+            let mut drive = Self::new();
+            assert_eq!(
+                drive.drive(2.0, |_| ()),
+                [State::Init, State::Converging, State::Localized]
+            );
+            assert_eq!(drive.monitor.verdict().causes, []);
+            drive
+        }
+
+        fn kinds(&self) -> Vec<CauseKind> {
+            self.monitor
+                .verdict()
+                .causes
+                .iter()
+                .map(|cause| cause.kind)
+                .collect()
+        }
+    }
+
+    fn wrong_pose(update: &mut Update) {
+        update.alignment = 0.29;
+        update.residual = 0.5;
+        update.long_beams = 0.4;
+        update.w_ratio = 0.2;
+    }
+
+    #[test]
+    fn standing_still_confirms_no_pose() {
+        let mut drive = Drive::new();
+        let states = drive.drive(5.0, |update| update.pose = Pose::IDENTITY);
+        assert_eq!(states, [State::Init, State::Converging]);
+        assert_eq!(drive.kinds(), [CauseKind::NewPose]);
+    }
+
+    #[test]
+    fn a_wrong_pose_is_lost_within_half_a_second_and_recovers_by_way_of_converging() {
+        let mut drive = Drive::localized();
+        let states = drive.drive(0.5, wrong_pose);
+        assert_eq!(states, [State::Localized, State::Degraded, State::Lost]);
+        assert!(drive.kinds().contains(&CauseKind::Alignment));
+        assert!(drive.kinds().contains(&CauseKind::LongBeams));
+        let states = drive.drive(3.0, |_| ());
+        assert_eq!(states, [State::Lost, State::Converging, State::Localized]);
+    }
+
+    #[test]
+    fn one_family_alone_degrades_and_is_never_lost() {
+        let alone: [fn(&mut Update); 4] = [
+            |update| {
+                update.alignment = 0.2;
+                update.residual = 0.6;
+            },
+            |update| update.long_beams = 0.5,
+            |update| update.w_ratio = 0.1,
+            |update| {
+                update.spread = [5.0, 2.0];
+                update.second_mode = 0.9;
+                update.ess_ratio = 0.001;
+            },
+        ];
+        for change in alone {
+            let mut drive = Drive::localized();
+            assert_eq!(drive.drive(5.0, change), [State::Localized, State::Degraded]);
+        }
+    }
+
+    #[test]
+    fn an_opponent_in_view_does_not_even_degrade() {
+        let mut drive = Drive::localized();
+        let states = drive.drive(3.0, |update| {
+            update.short_beams = 0.6;
+            update.alignment = 0.35;
+            update.residual = 0.5;
+            update.w_ratio = 0.3;
+        });
+        assert_eq!(states, [State::Localized]);
+        assert_eq!(drive.kinds(), [CauseKind::Occluded]);
+    }
+
+    #[test]
+    fn slip_and_lost_returns_are_told_but_change_nothing() {
+        let mut drive = Drive::localized();
+        let states = drive.drive(2.0, |update| {
+            update.slip = 0.25;
+            update.no_return = 0.5;
+        });
+        assert_eq!(states, [State::Localized]);
+        assert_eq!(drive.kinds(), [CauseKind::Slip, CauseKind::NoReturn]);
+    }
+
+    #[test]
+    fn two_bad_scans_do_not_degrade_and_three_do() {
+        let mut drive = Drive::localized();
+        let jump = |update: &mut Update| update.innovation = [0.5, 0.0];
+        assert_eq!(drive.drive(2.0 * SCAN, jump), [State::Localized]);
+        assert_eq!(drive.drive(SCAN, |_| ()), [State::Localized]);
+        assert_eq!(drive.drive(3.0 * SCAN, jump), [State::Localized, State::Degraded]);
+        assert_eq!(
+            drive.drive(1.0, |_| ()),
+            [State::Degraded, State::Localized],
+            "half a second of good scans mends it"
+        );
+    }
+
+    #[test]
+    fn silence_is_stale_with_the_sensor_named_and_a_short_one_leads_back() {
+        let mut drive = Drive::localized();
+        // Odometry goes on, scans do not.
+        for _ in 0..40 {
+            drive.now = drive.now.plus(SCAN);
+            drive.monitor.on_odometry(drive.now);
+            drive.monitor.tick(drive.now);
+        }
+        assert_eq!(drive.monitor.verdict().state, State::Stale);
+        assert_eq!(drive.kinds(), [CauseKind::NoScan]);
+        let states = drive.drive(2.0, |_| ());
+        assert_eq!(states, [State::Stale, State::Degraded, State::Localized]);
+    }
+
+    #[test]
+    fn a_gap_as_in_a_real_log_is_not_stale() {
+        let mut drive = Drive::localized();
+        drive.now = drive.now.plus(0.14);
+        assert_eq!(drive.monitor.tick(drive.now).state, State::Localized);
+    }
+
+    #[test]
+    fn nothing_at_all_stays_init_and_says_why() {
+        let now = Stamp(0);
+        let mut monitor = Monitor::new(Thresholds::default(), now);
+        let verdict = monitor.tick(now.plus(10.0));
+        assert_eq!(verdict.state, State::Init);
+        let kinds: Vec<_> = verdict.causes.iter().map(|cause| cause.kind).collect();
+        assert_eq!(
+            kinds,
+            [CauseKind::NoScan, CauseKind::NoOdometry, CauseKind::NoInitialPose]
+        );
+    }
+
+    #[test]
+    fn a_search_is_relocalizing_until_a_pose_is_found() {
+        let mut drive = Drive::localized();
+        let searching = |update: &mut Update| update.mode = Mode::Searching;
+        assert_eq!(
+            drive.drive(1.0, searching),
+            [State::Localized, State::Relocalizing]
+        );
+        assert!(drive.kinds().contains(&CauseKind::Searching));
+        assert_eq!(
+            drive.drive(2.0, |_| ()),
+            [State::Relocalizing, State::Converging, State::Localized]
+        );
+    }
+}

@@ -1,0 +1,560 @@
+//! Which parameter sets a car has, which one is in force, and what may become of it. Pure: the caller swaps
+//! the set in the filter, keeps the file and brings the time.
+//!
+//! Changing the set takes two steps: [`Keeper::plan`] says what would be in force, or why not; once the filter
+//! has taken it, [`Keeper::commit`] makes it so. In between nothing has changed.
+
+use std::collections::BTreeMap;
+
+use protocol::{ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
+use serde::{Deserialize, Serialize};
+use synpf::{Parameters, Stamp};
+
+use crate::sets;
+use crate::wire;
+
+/// A set that was put on the car.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stored {
+    /// The values.
+    pub parameters: Parameters,
+    /// Who put it there.
+    pub who: String,
+}
+
+/// What survives a restart.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Memory {
+    /// Changes of the set in force since the car was first set up.
+    pub revision: u64,
+    /// The set to start with: the last one in force that nobody could still fall back from.
+    pub settled: Option<String>,
+    /// The sets that were put on the car, by name.
+    pub sets: BTreeMap<String, Stored>,
+}
+
+/// The set in force.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InForce {
+    /// Its name.
+    pub name: String,
+    /// Its values.
+    pub parameters: Parameters,
+    /// Who put it in force.
+    pub who: String,
+    /// When, in wall time.
+    pub when: Stamp,
+    /// The first update under it.
+    pub since_update: u64,
+}
+
+/// The car will go back by itself.
+#[derive(Debug, Clone, PartialEq)]
+struct Pending {
+    to: (String, Parameters),
+    at: Stamp,
+}
+
+/// A change that can be made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// The set's name.
+    pub name: String,
+    /// Its values.
+    pub parameters: Parameters,
+    /// It is new on the car and must be stored.
+    pub store: bool,
+    /// Fall back after this time unless confirmed [s].
+    pub revert_after: Option<f64>,
+}
+
+/// What a command about sets comes to.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Decision {
+    /// Swap the set, then [`Keeper::commit`].
+    Change(Plan),
+    /// Keep what is in force; nobody falls back any more.
+    Confirmed,
+    /// A set is gone.
+    Deleted(String),
+    /// All sets.
+    Sets(Vec<StoredSet>),
+}
+
+/// Why not.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Refusal {
+    /// Every fault.
+    Faults(Vec<String>),
+    /// The set in force has another revision than the command expects.
+    Stale {
+        /// What it expects.
+        expected: u64,
+    },
+}
+
+/// A `revert_after` beyond this is a mistake [s].
+const LONGEST_TRIAL: f64 = 3600.0;
+/// Most sets on one car.
+const MOST_SETS: usize = 64;
+
+/// The sets of one car.
+#[derive(Debug)]
+pub struct Keeper {
+    memory: Memory,
+    in_force: InForce,
+    previous: Option<(String, Parameters)>,
+    pending: Option<Pending>,
+}
+
+impl Keeper {
+    /// A keeper that starts with the set `name` in force.
+    pub fn new(mut memory: Memory, name: String, parameters: Parameters, now: Stamp) -> Self {
+        memory.revision += 1;
+        memory.settled = Some(name.clone());
+        Self {
+            memory,
+            in_force: InForce {
+                name,
+                parameters,
+                who: "start".into(),
+                when: now,
+                since_update: 1,
+            },
+            previous: None,
+            pending: None,
+        }
+    }
+
+    /// What must survive a restart.
+    pub fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    /// The set in force.
+    pub fn in_force(&self) -> &InForce {
+        &self.in_force
+    }
+
+    /// The set in force by name and revision.
+    pub fn reference(&self) -> SetRef {
+        SetRef {
+            name: self.in_force.name.clone(),
+            revision: self.memory.revision,
+        }
+    }
+
+    /// When the car falls back by itself.
+    pub fn falls_back_at(&self) -> Option<Stamp> {
+        self.pending.as_ref().map(|pending| pending.at)
+    }
+
+    /// The message about it all.
+    pub fn params(&self) -> protocol::Params {
+        protocol::Params {
+            set: parameter_set(&self.in_force.name, &self.in_force.parameters),
+            revision: self.memory.revision,
+            who: self.in_force.who.clone(),
+            when: self.in_force.when.0,
+            since_update: self.in_force.since_update,
+            pending_revert: self.pending.as_ref().map(|pending| PendingRevert {
+                to: pending.to.0.clone(),
+                at: pending.at.0,
+            }),
+            available: Parameters::NAMES
+                .iter()
+                .map(|name| (*name).to_owned())
+                .chain(self.memory.sets.keys().cloned())
+                .collect(),
+        }
+    }
+
+    /// What a command comes to. Confirming and deleting are done with that; a change is not.
+    pub fn plan(
+        &mut self,
+        action: &ParamsAction,
+        expected_revision: Option<u64>,
+    ) -> Result<Decision, Refusal> {
+        let reads_only = matches!(action, ParamsAction::List);
+        if let Some(expected) = expected_revision
+            && expected != self.memory.revision
+            && !reads_only
+        {
+            return Err(Refusal::Stale { expected });
+        }
+        let fault = |text: String| Refusal::Faults(vec![text]);
+        match action {
+            ParamsAction::Select {
+                name,
+                revert_after_ms,
+            } => {
+                let parameters = self.find(name).ok_or_else(|| fault(self.no_such_set(name)))?;
+                Ok(Decision::Change(Plan {
+                    name: name.clone(),
+                    parameters,
+                    store: false,
+                    revert_after: trial(*revert_after_ms).map_err(fault)?,
+                }))
+            }
+            ParamsAction::Put { set, revert_after_ms } => self.plan_put(set, *revert_after_ms),
+            ParamsAction::Confirm => {
+                if self.pending.take().is_none() {
+                    return Err(fault("nothing to confirm: the set in force stays anyway".into()));
+                }
+                self.memory.settled = Some(self.in_force.name.clone());
+                Ok(Decision::Confirmed)
+            }
+            ParamsAction::Revert => {
+                let (name, parameters) = self
+                    .previous
+                    .clone()
+                    .ok_or_else(|| fault("no set was in force before this one".into()))?;
+                Ok(Decision::Change(Plan {
+                    name,
+                    parameters,
+                    store: false,
+                    revert_after: None,
+                }))
+            }
+            ParamsAction::Delete { name } => {
+                if Parameters::NAMES.contains(&name.as_str()) {
+                    return Err(fault(format!("{name} ships with the node and stays")));
+                }
+                if *name == self.in_force.name {
+                    return Err(fault(format!("{name} is in force")));
+                }
+                if self.pending.as_ref().is_some_and(|pending| pending.to.0 == *name) {
+                    return Err(fault(format!("the car may fall back to {name}")));
+                }
+                match self.memory.sets.remove(name) {
+                    Some(_) => Ok(Decision::Deleted(name.clone())),
+                    None => Err(fault(self.no_such_set(name))),
+                }
+            }
+            ParamsAction::List => Ok(Decision::Sets(self.list())),
+        }
+    }
+
+    fn plan_put(&self, set: &ParameterSet, revert_after_ms: Option<u32>) -> Result<Decision, Refusal> {
+        let mut faults = Vec::new();
+        if Parameters::NAMES.contains(&set.name.as_str()) {
+            faults.push(format!(
+                "{} ships with the node and cannot be overwritten",
+                set.name
+            ));
+        }
+        if self.memory.sets.len() >= MOST_SETS && !self.memory.sets.contains_key(&set.name) {
+            faults.push(format!("the car has {MOST_SETS} sets; delete one first"));
+        }
+        let revert_after = trial(revert_after_ms).unwrap_or_else(|fault| {
+            faults.push(fault);
+            None
+        });
+        let given = set
+            .values
+            .iter()
+            .map(|(key, value)| (key.clone(), wire::json(value)));
+        match sets::with_values(&self.in_force.parameters, given) {
+            Ok(parameters) if faults.is_empty() => Ok(Decision::Change(Plan {
+                name: set.name.clone(),
+                parameters,
+                store: true,
+                revert_after,
+            })),
+            Ok(_) => Err(Refusal::Faults(faults)),
+            Err(more) => {
+                faults.extend(more.iter().map(ToString::to_string));
+                Err(Refusal::Faults(faults))
+            }
+        }
+    }
+
+    /// Keeps a planned set on the car, before it is in force. Returns what was there under its name.
+    pub fn store(&mut self, plan: &Plan, who: &str) -> Option<Stored> {
+        self.memory.sets.insert(
+            plan.name.clone(),
+            Stored {
+                parameters: plan.parameters.clone(),
+                who: who.into(),
+            },
+        )
+    }
+
+    /// Undoes [`Self::store`].
+    pub fn unstore(&mut self, name: &str, before: Option<Stored>) {
+        match before {
+            Some(stored) => self.memory.sets.insert(name.into(), stored),
+            None => self.memory.sets.remove(name),
+        };
+    }
+
+    /// The filter has taken the planned set, from `update` on. Returns the set that was in force before.
+    pub fn commit(&mut self, plan: Plan, who: &str, now: Stamp, update: u64) -> SetRef {
+        let before = self.reference();
+        let in_force = InForce {
+            name: plan.name,
+            parameters: plan.parameters,
+            who: who.into(),
+            when: now,
+            since_update: update,
+        };
+        let old = std::mem::replace(&mut self.in_force, in_force);
+        // A second trial on top of a first falls back to what was there before both.
+        let settled = self
+            .pending
+            .take()
+            .map_or((old.name.clone(), old.parameters.clone()), |pending| pending.to);
+        self.previous = Some((old.name, old.parameters));
+        self.memory.revision += 1;
+        match plan.revert_after {
+            Some(seconds) => {
+                self.memory.settled = Some(settled.0.clone());
+                self.pending = Some(Pending {
+                    to: settled,
+                    at: now.plus(seconds),
+                });
+            }
+            None => self.memory.settled = Some(self.in_force.name.clone()),
+        }
+        before
+    }
+
+    /// The change that is due because nobody confirmed.
+    pub fn fall_back(&self, now: Stamp) -> Option<Plan> {
+        let pending = self.pending.as_ref().filter(|pending| pending.at <= now)?;
+        Some(Plan {
+            name: pending.to.0.clone(),
+            parameters: pending.to.1.clone(),
+            store: false,
+            revert_after: None,
+        })
+    }
+
+    fn find(&self, name: &str) -> Option<Parameters> {
+        Parameters::named(name).or_else(|| Some(self.memory.sets.get(name)?.parameters.clone()))
+    }
+
+    fn no_such_set(&self, name: &str) -> String {
+        format!(
+            "no set {name:?} on this car; there are {}",
+            self.params().available.join(", ")
+        )
+    }
+
+    fn list(&self) -> Vec<StoredSet> {
+        let shipped = Parameters::NAMES.iter().filter_map(|name| {
+            Some(StoredSet {
+                set: parameter_set(name, &Parameters::named(name)?),
+                built_in: true,
+                who: None,
+            })
+        });
+        let put = self.memory.sets.iter().map(|(name, stored)| StoredSet {
+            set: parameter_set(name, &stored.parameters),
+            built_in: false,
+            who: Some(stored.who.clone()),
+        });
+        shipped.chain(put).collect()
+    }
+}
+
+/// `revert_after` in seconds, if it makes sense.
+fn trial(milliseconds: Option<u32>) -> Result<Option<f64>, String> {
+    let Some(milliseconds) = milliseconds else {
+        return Ok(None);
+    };
+    let seconds = f64::from(milliseconds) / 1000.0;
+    if (0.1..=LONGEST_TRIAL).contains(&seconds) {
+        Ok(Some(seconds))
+    } else {
+        Err(format!(
+            "revert_after: {seconds} s is not between 0.1 and {LONGEST_TRIAL} s"
+        ))
+    }
+}
+
+/// A set as it travels.
+fn parameter_set(name: &str, parameters: &Parameters) -> ParameterSet {
+    ParameterSet {
+        name: name.into(),
+        values: sets::values(parameters)
+            .iter()
+            .filter_map(|(key, value)| Some((key.clone(), wire::value(value)?)))
+            .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Value;
+
+    const NOW: Stamp = Stamp(1_000_000_000);
+
+    fn keeper() -> Keeper {
+        let hq = Parameters::named("hq").expect("ships");
+        Keeper::new(Memory::default(), "hq".into(), hq, NOW)
+    }
+
+    fn select(name: &str, revert_after_ms: Option<u32>) -> ParamsAction {
+        ParamsAction::Select {
+            name: name.into(),
+            revert_after_ms,
+        }
+    }
+
+    fn put(name: &str, values: &[(&str, Value)]) -> ParamsAction {
+        ParamsAction::Put {
+            set: ParameterSet {
+                name: name.into(),
+                values: values
+                    .iter()
+                    .map(|(key, value)| ((*key).to_owned(), value.clone()))
+                    .collect(),
+            },
+            revert_after_ms: None,
+        }
+    }
+
+    fn change(keeper: &mut Keeper, action: &ParamsAction, now: Stamp) {
+        match keeper.plan(action, None).expect("planned") {
+            Decision::Change(plan) => {
+                if plan.store {
+                    keeper.store(&plan, "anna");
+                }
+                keeper.commit(plan, "anna", now, 7);
+            }
+            other => panic!("no change: {other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_planned_change_that_is_not_made_leaves_no_trace() {
+        let mut keeper = keeper();
+        let before = keeper.params();
+        keeper.plan(&select("lq", None), None).expect("planned");
+        keeper
+            .plan(&put("mine", &[("max_particles", Value::Int(1500))]), None)
+            .expect("planned");
+        assert_eq!(keeper.params(), before);
+    }
+
+    #[test]
+    fn selecting_and_reverting_count_up() {
+        let mut keeper = keeper();
+        let first = keeper.reference().revision;
+        change(&mut keeper, &select("lq", None), NOW);
+        assert_eq!(
+            keeper.reference(),
+            SetRef {
+                name: "lq".into(),
+                revision: first + 1
+            }
+        );
+        assert_eq!(keeper.params().since_update, 7);
+        change(&mut keeper, &ParamsAction::Revert, NOW);
+        assert_eq!(
+            keeper.reference(),
+            SetRef {
+                name: "hq".into(),
+                revision: first + 2
+            }
+        );
+    }
+
+    #[test]
+    fn a_stale_revision_changes_nothing() {
+        let mut keeper = keeper();
+        let seen = keeper.reference().revision;
+        change(&mut keeper, &select("lq", None), NOW);
+        assert_eq!(
+            keeper.plan(&select("adaptive", None), Some(seen)),
+            Err(Refusal::Stale { expected: seen })
+        );
+        assert_eq!(keeper.reference().name, "lq");
+        assert!(
+            keeper.plan(&ParamsAction::List, Some(seen)).is_ok(),
+            "looking is always allowed"
+        );
+    }
+
+    #[test]
+    fn a_trial_falls_back_unless_confirmed() {
+        let mut keeper = keeper();
+        change(&mut keeper, &select("lq", Some(5000)), NOW);
+        assert_eq!(keeper.memory().settled.as_deref(), Some("hq"));
+        // A trial within a trial goes back to where both began.
+        change(&mut keeper, &select("adaptive", Some(5000)), NOW.plus(1.0));
+        assert_eq!(keeper.fall_back(NOW.plus(5.9)), None);
+        let plan = keeper.fall_back(NOW.plus(6.0)).expect("due");
+        assert_eq!(plan.name, "hq");
+        keeper.commit(plan, "start", NOW.plus(6.0), 9);
+        assert_eq!(keeper.falls_back_at(), None);
+
+        change(&mut keeper, &select("lq", Some(5000)), NOW);
+        assert_eq!(keeper.plan(&ParamsAction::Confirm, None), Ok(Decision::Confirmed));
+        assert_eq!(keeper.fall_back(NOW.plus(60.0)), None);
+        assert_eq!(keeper.memory().settled.as_deref(), Some("lq"));
+        assert!(
+            keeper.plan(&ParamsAction::Confirm, None).is_err(),
+            "once is enough"
+        );
+    }
+
+    #[test]
+    fn a_put_set_keeps_the_rest_of_the_one_in_force_and_survives() {
+        let mut keeper = keeper();
+        change(
+            &mut keeper,
+            &put("mine", &[("max_particles", Value::Int(1500))]),
+            NOW,
+        );
+        assert_eq!(keeper.in_force().parameters.max_particles, 1500);
+        assert!(keeper.params().available.contains(&"mine".to_owned()));
+
+        let text = serde_json::to_string(keeper.memory()).expect("writes");
+        let memory: Memory = serde_json::from_str(&text).expect("reads");
+        let mut again = Keeper::new(memory, "hq".into(), Parameters::default(), NOW);
+        assert!(again.reference().revision > keeper.reference().revision);
+        change(&mut again, &select("mine", None), NOW);
+        assert_eq!(again.in_force().parameters.max_particles, 1500);
+
+        let delete = ParamsAction::Delete { name: "mine".into() };
+        assert!(again.plan(&delete, None).is_err(), "in force");
+        change(&mut again, &select("hq", None), NOW);
+        assert_eq!(again.plan(&delete, None), Ok(Decision::Deleted("mine".into())));
+        assert!(again.plan(&select("mine", None), None).is_err());
+    }
+
+    #[test]
+    fn a_faulty_set_is_refused_whole_with_every_fault() {
+        let mut keeper = keeper();
+        let action = put(
+            "hq",
+            &[
+                ("max_particles", Value::Text("many".into())),
+                ("speed_of_light", Value::Float(3e8)),
+                ("no_such_key", Value::Bool(true)),
+            ],
+        );
+        let Err(Refusal::Faults(faults)) = keeper.plan(&action, None) else {
+            panic!("accepted");
+        };
+        for word in ["hq ships", "max_particles", "speed_of_light", "no_such_key"] {
+            assert!(
+                faults.iter().any(|fault| fault.contains(word)),
+                "{word} not in {faults:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn absurd_trials_are_refused() {
+        let mut keeper = keeper();
+        for milliseconds in [0, 50, u32::MAX] {
+            assert!(keeper.plan(&select("lq", Some(milliseconds)), None).is_err());
+        }
+    }
+}

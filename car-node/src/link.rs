@@ -1,0 +1,171 @@
+//! The network: the only file, with its publisher and its desk, that names zenoh.
+//!
+//! The car dials the pit wall as a peer and listens to nobody. It never blocks: what a slow link cannot take is
+//! dropped, and the streams that must be whole are recovered from caches on the car.
+
+use std::time::Duration;
+
+use protocol::{CarName, Key, Topic};
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::{Config, Session, Wait};
+use zenoh_ext::{
+    AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig,
+};
+
+/// How long the caches reach back [s]: a lap out of radio contact.
+const CACHE: f64 = 30.0;
+/// Highest rate of a recorded stream [Hz].
+const RECORDED_RATE: f64 = 100.0;
+
+/// Why there is no link.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// A setting that zenoh refuses, such as a malformed endpoint.
+    #[error("zenoh refuses {key} = {value}: {reason}")]
+    Config {
+        /// The setting.
+        key: &'static str,
+        /// Its value.
+        value: String,
+        /// Why.
+        reason: String,
+    },
+    /// The session does not open.
+    #[error("the zenoh session does not open: {0}")]
+    Open(String),
+    /// A publisher or a queryable cannot be declared.
+    #[error("{key}: {reason}")]
+    Declare {
+        /// Its key.
+        key: String,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Where a pit wall on this machine listens.
+const LOCAL_WALL: &str = "tcp/127.0.0.1:7447";
+
+/// Opens a session that dials `connect`; without one it looks for a pit wall on this machine and by multicast.
+pub fn open(connect: &[String]) -> Result<Session, LinkError> {
+    let scout = connect.is_empty().to_string();
+    let endpoints = if connect.is_empty() {
+        serde_json::json!([LOCAL_WALL]).to_string()
+    } else {
+        serde_json::json!(connect).to_string()
+    };
+    let settings = [
+        ("mode", r#""peer""#.to_owned()),
+        ("connect/endpoints", endpoints),
+        ("connect/exit_on_failure", "false".to_owned()),
+        ("connect/timeout_ms", "-1".to_owned()),
+        (
+            "connect/retry",
+            r#"{"period_init_ms":200,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned(),
+        ),
+        // Only cars dial: two that dial each other can end up half connected for good.
+        ("listen/endpoints", "[]".to_owned()),
+        ("scouting/multicast/enabled", scout),
+        ("scouting/gossip/enabled", "false".to_owned()),
+        // A cut link is noticed within two seconds.
+        ("transport/link/tx/lease", "2000".to_owned()),
+    ];
+    let mut config = Config::default();
+    for (key, value) in settings {
+        config
+            .insert_json5(key, &value)
+            .map_err(|error| LinkError::Config {
+                key,
+                value,
+                reason: error.to_string(),
+            })?;
+    }
+    zenoh::open(config)
+        .wait()
+        .map_err(|error| LinkError::Open(error.to_string()))
+}
+
+/// Closes a session, but waits no longer than `patience`: on a dead link it would take 12 s.
+pub fn close(session: &Session, patience: Duration) {
+    let session = session.clone();
+    let (done, closed) = crossbeam_channel::bounded(1);
+    let spawned = std::thread::Builder::new().name("close".into()).spawn(move || {
+        if let Err(error) = session.close().wait() {
+            tracing::debug!(%error, "closing the session");
+        }
+        done.send(()).ok();
+    });
+    if spawned.is_ok() && closed.recv_timeout(patience).is_err() {
+        tracing::debug!("the session did not close in time");
+    }
+}
+
+/// Says that the car is there, for as long as the token is kept.
+pub fn declare_alive(session: &Session, car: &CarName) -> Result<LivelinessToken, LinkError> {
+    let key = Key::new(car.clone(), Topic::Alive).to_string();
+    session
+        .liveliness()
+        .declare_token(&key)
+        .wait()
+        .map_err(|error| LinkError::Declare {
+            key,
+            reason: error.to_string(),
+        })
+}
+
+/// A way out for one topic.
+#[derive(Debug)]
+pub enum Outlet {
+    /// Newest wins: what the link cannot take is gone.
+    Live(Publisher<'static>),
+    /// Cached on the car, so that a gap can be filled later.
+    Recovered(AdvancedPublisher<'static>),
+}
+
+impl Outlet {
+    /// Declares the publisher of a topic.
+    pub fn declare(session: &Session, car: &CarName, topic: Topic) -> Result<Self, LinkError> {
+        let key = Key::new(car.clone(), topic).to_string();
+        let failed = |error: zenoh::Error| LinkError::Declare {
+            key: key.clone(),
+            reason: error.to_string(),
+        };
+        let priority = match topic {
+            Topic::Pose | Topic::Event => Priority::RealTime,
+            Topic::Health => Priority::InteractiveHigh,
+            Topic::Cloud | Topic::Scan => Priority::DataLow,
+            topic if topic.recorded() => Priority::DataLow,
+            _ => Priority::Data,
+        };
+        let builder = session
+            .declare_publisher(key.clone())
+            .congestion_control(CongestionControl::Drop)
+            .priority(priority);
+        if !topic.recovered() {
+            return builder.wait().map(Self::Live).map_err(failed);
+        }
+        let replies = RepliesConfig::default()
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::DataLow);
+        let cache = CacheConfig::default()
+            .max_samples((CACHE * RECORDED_RATE) as usize)
+            .replies_config(replies);
+        builder
+            .cache(cache)
+            .sample_miss_detection(MissDetectionConfig::default().heartbeat(Duration::from_millis(500)))
+            .publisher_detection()
+            .wait()
+            .map(Self::Recovered)
+            .map_err(failed)
+    }
+
+    /// Sends.
+    pub fn put(&self, bytes: Vec<u8>) -> Result<(), zenoh::Error> {
+        match self {
+            Self::Live(publisher) => publisher.put(bytes).wait(),
+            Self::Recovered(publisher) => publisher.put(bytes).wait(),
+        }
+    }
+}

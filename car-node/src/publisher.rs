@@ -1,0 +1,191 @@
+//! The telemetry thread: takes what the others have left, and sends it. A slow network slows down nobody else.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, TryRecvError};
+use protocol::{CarName, Message, Stamps, Topic, encode};
+use synpf::Stamp;
+use zenoh::Session;
+
+use crate::clock::{SensorClock, wall_now};
+use crate::filter::Shared;
+use crate::link::{LinkError, Outlet};
+use crate::outbox::Record;
+use crate::wire;
+
+/// Everything that goes out.
+pub const TOPICS: [Topic; 12] = [
+    Topic::Pose,
+    Topic::Cloud,
+    Topic::Scan,
+    Topic::Health,
+    Topic::Load,
+    Topic::Params,
+    Topic::Event,
+    Topic::RecordedPose,
+    Topic::RecordedHealth,
+    Topic::RecordedOdometry,
+    Topic::RecordedScan,
+    Topic::RecordedTruth,
+];
+
+/// Looks for a stop at least this often.
+const TICK: Duration = Duration::from_millis(50);
+
+/// One topic's way out, and how many messages have taken it.
+struct Stream {
+    outlet: Outlet,
+    sequence: u64,
+}
+
+/// Sends a car's telemetry.
+pub struct Publisher {
+    streams: HashMap<Topic, Stream>,
+    session_number: u64,
+    clock: SensorClock,
+    shared: Arc<Shared>,
+    failed: HashMap<Topic, u64>,
+}
+
+impl Publisher {
+    /// Declares every topic on `session`. `session_number` tells this run of the node from others.
+    pub fn new(
+        session: &Session,
+        car: &CarName,
+        session_number: u64,
+        clock: SensorClock,
+        shared: Arc<Shared>,
+    ) -> Result<Self, LinkError> {
+        let streams = TOPICS
+            .into_iter()
+            .map(|topic| {
+                let outlet = Outlet::declare(session, car, topic)?;
+                Ok((topic, Stream { outlet, sequence: 0 }))
+            })
+            .collect::<Result<_, LinkError>>()?;
+        Ok(Self {
+            streams,
+            session_number,
+            clock,
+            shared,
+            failed: HashMap::new(),
+        })
+    }
+
+    /// Starts the thread. Once `stop` is dropped it sends what is left, and ends.
+    pub fn start(mut self, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
+        thread::Builder::new().name("publisher".into()).spawn(move || {
+            while stop.try_recv() == Err(TryRecvError::Empty) {
+                self.shared.outbox.wait(TICK);
+                self.flush();
+            }
+            self.flush();
+        })
+    }
+
+    /// Sends all that is there, the pose first.
+    fn flush(&mut self) {
+        let shared = Arc::clone(&self.shared);
+        if let Some(pose) = shared.outbox.take_pose() {
+            self.send(
+                Topic::Pose,
+                self.clock.wall(pose.stamp),
+                &wire::pose_message(&pose),
+            );
+            shared
+                .counters
+                .published(self.clock.now().since(pose.stamp).max(0.0));
+        }
+        while let Some(record) = shared.outbox.next_record() {
+            self.send_record(record);
+        }
+        if let Some(cloud) = shared.outbox.take_cloud() {
+            self.send(Topic::Cloud, self.clock.wall(cloud.stamp), &wire::cloud(&cloud));
+        }
+        if let Some(scan) = shared.outbox.take_scan() {
+            self.send(Topic::Scan, self.clock.wall(scan.stamp), &wire::scan_view(&scan));
+        }
+    }
+
+    fn send_record(&mut self, record: Record) {
+        match record {
+            Record::Pose(pose) => self.send(
+                Topic::RecordedPose,
+                self.clock.wall(pose.stamp),
+                &wire::pose_message(&pose),
+            ),
+            Record::Health {
+                report,
+                live,
+                recorded,
+            } => {
+                let stamp = self.clock.wall(report.stamp);
+                let message = wire::health(&report, &self.clock);
+                if live {
+                    self.send(Topic::Health, stamp, &message);
+                }
+                if recorded {
+                    self.send(Topic::RecordedHealth, stamp, &message);
+                }
+            }
+            Record::Odometry(odometry) => self.send(
+                Topic::RecordedOdometry,
+                self.clock.wall(odometry.stamp),
+                &wire::odometry(&odometry),
+            ),
+            Record::Scan(scan) => {
+                self.send(
+                    Topic::RecordedScan,
+                    self.clock.wall(scan.stamp),
+                    &wire::scan(&scan),
+                );
+            }
+            Record::Truth(truth) => self.send(
+                Topic::RecordedTruth,
+                self.clock.wall(truth.stamp),
+                &wire::truth(&truth),
+            ),
+            Record::Params(params) => self.send(Topic::Params, wall_now(), params.as_ref()),
+            Record::Load(load) => self.send(Topic::Load, wall_now(), load.as_ref()),
+            Record::Event(event) => self.send(
+                Topic::Event,
+                self.clock.wall(event.stamp),
+                &protocol::Event {
+                    kind: event.kind,
+                    update: event.update,
+                    who: event.who,
+                    command: event.command,
+                },
+            ),
+        }
+    }
+
+    fn send<M: Message>(&mut self, topic: Topic, sensor: Stamp, message: &M) {
+        let Some(stream) = self.streams.get_mut(&topic) else {
+            return;
+        };
+        let stamps = Stamps {
+            session: self.session_number,
+            sequence: stream.sequence + 1,
+            sensor: sensor.0,
+            published: wall_now().0,
+        };
+        let sent = encode(message, stamps)
+            .map_err(|error| error.to_string())
+            .and_then(|bytes| {
+                stream.sequence += 1;
+                stream.outlet.put(bytes).map_err(|error| error.to_string())
+            });
+        if let Err(error) = sent {
+            let failed = self.failed.entry(topic).or_default();
+            *failed += 1;
+            // Once, and then at every power of two: a fault at 40 Hz must not fill the disk.
+            if failed.is_power_of_two() {
+                tracing::warn!(%topic, failed, error, "a message did not go out");
+            }
+        }
+    }
+}

@@ -1,0 +1,393 @@
+//! A whole car on a simulated track, seen from the network: a router on loopback stands in for the pit wall.
+
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use car_node::node::{Node, NodeConfig, RaceMap};
+use car_node::source::Race;
+use protocol::{
+    Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, Message, Outcome,
+    ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Stamps, State, Topic, Value, decode,
+    encode,
+};
+use simulator::{CarSetup, Track};
+use synpf::TrackMap;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::Sample;
+use zenoh::{Config, Session, Wait};
+
+const DEADLINE: Duration = Duration::from_secs(30);
+
+/// The laptop's end.
+struct Wall {
+    session: Session,
+    endpoint: String,
+}
+
+impl Wall {
+    fn open() -> Self {
+        // The port is free when this looks; another test taking it meanwhile would fail loudly.
+        let port = TcpListener::bind("127.0.0.1:0")
+            .and_then(|listener| listener.local_addr())
+            .expect("a free port")
+            .port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let mut config = Config::default();
+        for (key, value) in [
+            ("mode", r#""router""#.to_owned()),
+            ("listen/endpoints", format!("[{endpoint:?}]")),
+            ("scouting/multicast/enabled", "false".into()),
+            ("scouting/gossip/enabled", "false".into()),
+        ] {
+            config.insert_json5(key, &value).expect("a setting");
+        }
+        Self {
+            session: zenoh::open(config).wait().expect("a router"),
+            endpoint,
+        }
+    }
+
+    fn subscribe(&self, car: &CarName, topic: Topic) -> Subscriber<FifoChannelHandler<Sample>> {
+        self.session
+            .declare_subscriber(Key::new(car.clone(), topic).to_string())
+            .with(zenoh::handlers::FifoChannel::new(65536))
+            .wait()
+            .expect("subscribes")
+    }
+
+    /// Asks a car; None when nobody answers, Err for an answer that says the question is broken.
+    fn ask(&self, key: &str, payload: Vec<u8>) -> Option<Result<Vec<u8>, String>> {
+        let replies = self
+            .session
+            .get(key)
+            .payload(payload)
+            .timeout(Duration::from_secs(10))
+            .wait()
+            .expect("asks");
+        let reply = replies.recv().ok()?;
+        Some(match reply.into_result() {
+            Ok(sample) => Ok(sample.payload().to_bytes().to_vec()),
+            Err(error) => Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned()),
+        })
+    }
+
+    fn command(&self, car: &CarName, id: u128, expected: Option<u64>, action: Action) -> Answer {
+        let topic = action.topic();
+        let command = Command {
+            id: CommandId(id),
+            operator: "anna".into(),
+            expected_revision: expected,
+            action,
+        };
+        let stamps = Stamps {
+            session: 1,
+            sequence: 1,
+            sensor: 0,
+            published: 0,
+        };
+        let bytes = encode(&command, stamps).expect("encodes");
+        let answer = self
+            .ask(&Key::new(car.clone(), topic).to_string(), bytes)
+            .expect("an answer")
+            .expect("a readable command");
+        let (_, answer) = decode::<Answer>(&answer).expect("an Answer");
+        assert_eq!(answer.id, CommandId(id));
+        answer
+    }
+}
+
+fn next<M: Message>(
+    subscriber: &Subscriber<FifoChannelHandler<Sample>>,
+    wanted: impl Fn(&M) -> bool,
+) -> (protocol::Header, M) {
+    let until = Instant::now() + DEADLINE;
+    while let Ok(Some(sample)) = subscriber.recv_deadline(until) {
+        let (header, message) = decode::<M>(&sample.payload().to_bytes()).expect("a message");
+        if wanted(&message) {
+            return (header, message);
+        }
+    }
+    panic!("nothing of the kind within {DEADLINE:?}");
+}
+
+fn tracks() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks")
+}
+
+fn start(name: &str, wall: &Wall, change: impl FnOnce(&mut NodeConfig)) -> (Node, CarName) {
+    let track = Track::load(tracks().join("club")).expect("bundled");
+    let map = RaceMap {
+        name: track.name.clone(),
+        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
+        raceline: Some(Arc::new(track.raceline.clone())),
+    };
+    let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
+    let car = CarName::new(name).expect("a name");
+    let mut config = NodeConfig::new(car.clone(), map, Box::new(race.car(0)));
+    config.connect = vec![wall.endpoint.clone()];
+    change(&mut config);
+    (Node::start(config).expect("starts"), car)
+}
+
+fn select(name: &str, revert_after_ms: Option<u32>) -> Action {
+    Action::Params(ParamsAction::Select {
+        name: name.into(),
+        revert_after_ms,
+    })
+}
+
+fn revision(answer: &Answer) -> u64 {
+    answer.set.revision
+}
+
+#[test]
+fn a_car_is_seen_from_its_first_pose_to_its_end() {
+    let wall = Wall::open();
+    let car = CarName::new("alpha").expect("a name");
+    let poses = wall.subscribe(&car, Topic::Pose);
+    let health = wall.subscribe(&car, Topic::Health);
+    let events = wall.subscribe(&car, Topic::Event);
+    let scans = wall.subscribe(&car, Topic::RecordedScan);
+    let (node, _) = start("alpha", &wall, |_| ());
+
+    let (first, pose) = next::<Pose>(&poses, |_| true);
+    assert!(pose.track.is_some(), "the raceline is known");
+    let (later, pose) = next::<Pose>(&poses, |pose| pose.update > 40);
+    assert_eq!(later.session, first.session);
+    assert!(pose.pose.x.is_finite());
+    assert!(later.sensor > first.sensor && later.published > later.sensor);
+    next::<Health>(&health, |health| {
+        health.state == State::Localized && health.metrics.is_some()
+    });
+    next::<Event>(&events, |event| matches!(event.kind, EventKind::Started { .. }));
+    next::<protocol::RecordedScan>(&scans, |scan| scan.ranges.len() == 1081);
+
+    let map = wall
+        .ask(&Key::new(car.clone(), Topic::Map).to_string(), Vec::new())
+        .expect("an answer")
+        .expect("a map");
+    let (_, map) = decode::<protocol::MapReply>(&map).expect("a map");
+    assert_eq!(map.name, "club");
+    assert!(map.raceline.is_some());
+
+    let before = Instant::now();
+    node.shutdown("test over");
+    assert!(before.elapsed() < Duration::from_secs(5), "ends in time");
+    next::<Event>(&events, |event| matches!(event.kind, EventKind::Stopping { .. }));
+}
+
+#[test]
+fn sets_are_switched_on_a_running_car() {
+    let wall = Wall::open();
+    let (node, car) = start("bravo", &wall, |_| ());
+    let params = wall.subscribe(&car, Topic::Params);
+    let poses = wall.subscribe(&car, Topic::Pose);
+    next::<Pose>(&poses, |pose| pose.update > 5);
+
+    let answer = wall.command(&car, 1, None, select("lq", None));
+    let Outcome::Done {
+        update: Some(update), ..
+    } = answer.outcome
+    else {
+        panic!("{answer:?}");
+    };
+    assert!(update > 5);
+    assert_eq!(answer.set.name, "lq");
+    let (_, told) = next::<Params>(&params, |params| params.set.name == "lq");
+    assert_eq!((told.revision, told.who.as_str()), (revision(&answer), "anna"));
+
+    // The same command again is answered again, and not done again.
+    assert_eq!(wall.command(&car, 1, None, select("lq", None)), answer);
+    // Somebody who has not seen it is told so.
+    let stale = wall.command(&car, 2, Some(revision(&answer) - 1), select("hq", None));
+    assert!(
+        matches!(stale.outcome, Outcome::StaleRevision { .. }),
+        "{stale:?}"
+    );
+    assert_eq!(stale.set, answer.set);
+    let unknown = wall.command(&car, 3, None, select("wet", None));
+    let Outcome::Refused { faults } = unknown.outcome else {
+        panic!("{unknown:?}");
+    };
+    assert!(
+        faults[0].contains("wet") && faults[0].contains("adaptive"),
+        "{faults:?}"
+    );
+
+    // A trial that nobody confirms ends by itself.
+    let trial = wall.command(&car, 4, Some(revision(&answer)), select("adaptive", Some(300)));
+    assert_eq!(trial.set.name, "adaptive");
+    let (_, told) = next::<Params>(&params, |params| params.revision > revision(&trial));
+    assert_eq!(told.set.name, "lq");
+
+    // No update was missed through all of this.
+    node.shutdown("test over");
+    let mut last = None;
+    while let Ok(Some(sample)) = poses.try_recv() {
+        let (header, pose) = decode::<Pose>(&sample.payload().to_bytes()).expect("a pose");
+        if let Some((sequence, update)) = last {
+            assert_eq!(header.sequence, sequence + 1);
+            assert_eq!(pose.update, update + 1);
+        }
+        last = Some((header.sequence, pose.update));
+    }
+    assert!(last.is_some());
+}
+
+#[test]
+fn a_set_put_on_the_car_survives_a_restart() {
+    let wall = Wall::open();
+    let folder = tempfile::tempdir().expect("folder");
+    let state = |config: &mut NodeConfig| config.state = Some(folder.path().into());
+    let (node, car) = start("charlie", &wall, state);
+    let put = |name: &str, value: Value| {
+        Action::Params(ParamsAction::Put {
+            set: ParameterSet {
+                name: name.into(),
+                values: vec![("max_particles".into(), value)],
+            },
+            revert_after_ms: None,
+        })
+    };
+    let faulty = wall.command(&car, 1, None, put("mine", Value::Text("many".into())));
+    assert!(matches!(faulty.outcome, Outcome::Refused { .. }), "{faulty:?}");
+    let answer = wall.command(&car, 2, None, put("mine", Value::Int(1500)));
+    assert!(matches!(answer.outcome, Outcome::Done { .. }), "{answer:?}");
+    node.shutdown("test over");
+
+    let (node, car) = start("charlie", &wall, state);
+    let list = wall.command(&car, 3, None, Action::Params(ParamsAction::List));
+    assert_eq!(list.set.name, "mine", "what was in force is in force again");
+    assert!(revision(&list) > revision(&answer));
+    let Outcome::Done {
+        reply: Reply::Sets(sets),
+        ..
+    } = list.outcome
+    else {
+        panic!("no list");
+    };
+    let mine = sets
+        .iter()
+        .find(|stored| stored.set.name == "mine")
+        .expect("kept");
+    assert!(
+        mine.set
+            .values
+            .contains(&("max_particles".into(), Value::Int(1500)))
+    );
+    assert_eq!(mine.who.as_deref(), Some("anna"));
+    node.shutdown("test over");
+}
+
+#[test]
+fn rubbish_is_refused_and_the_car_drives_on() {
+    let wall = Wall::open();
+    let (node, car) = start("delta", &wall, |_| ());
+    let load = wall.subscribe(&car, Topic::Load);
+    let key = |topic: Topic| Key::new(car.clone(), topic).to_string();
+    let mut rubbish: Vec<Vec<u8>> = vec![vec![], vec![0; 3], vec![0xff; 100_000], b"SYPF".to_vec()];
+    // Bytes from a fixed sequence, some of them with a sound header in front.
+    let stamps = Stamps {
+        session: 1,
+        sequence: 1,
+        sensor: 0,
+        published: 0,
+    };
+    let header = protocol::Header::new(protocol::Schema::Command, 1, stamps).to_bytes();
+    let mut state = 1_u64;
+    for length in [1, 17, 40, 64, 300] {
+        let noise: Vec<u8> = (0..length)
+            .map(|_| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                (state >> 56) as u8
+            })
+            .collect();
+        rubbish.push(noise.clone());
+        rubbish.push([header.as_slice(), &noise].concat());
+    }
+    let topics = [
+        Topic::CmdParams,
+        Topic::CmdPose,
+        Topic::CmdRelocalize,
+        Topic::CmdRates,
+        Topic::CmdAuto,
+    ];
+    let mut sent = 0;
+    for topic in topics {
+        for payload in &rubbish {
+            let answer = wall.ask(&key(topic), payload.clone()).expect("an answer");
+            assert!(answer.is_err(), "{topic} takes {payload:?}");
+            sent += 1;
+        }
+    }
+    let (_, seen) = next::<protocol::Load>(&load, |load| load.drops.payloads >= sent);
+    assert_eq!(seen.drops.payloads, sent);
+    let (_, seen) = next::<protocol::Load>(&load, |_| true);
+    assert!(seen.update_rate > 30.0, "{seen:?}");
+
+    // A command under another command's key, and one for all cars at once.
+    let command = Command {
+        id: CommandId(1),
+        operator: "anna".into(),
+        expected_revision: None,
+        action: Action::Rates(RatesAction::Set(Rates {
+            pose: 0.0,
+            cloud: 0.0,
+            scan: 0.0,
+            health: 0.0,
+            recorded: false,
+        })),
+    };
+    let bytes = encode(&command, stamps).expect("encodes");
+    for key in [key(Topic::CmdAuto), "synpf/v1/*/cmd/rates".to_owned()] {
+        assert!(
+            wall.ask(&key, bytes.clone()).expect("an answer").is_err(),
+            "{key}"
+        );
+    }
+    let answer = wall.command(&car, 2, None, Action::Rates(RatesAction::Get));
+    let Outcome::Done {
+        reply: Reply::Rates(rates),
+        ..
+    } = answer.outcome
+    else {
+        panic!("{answer:?}");
+    };
+    assert!(rates.recorded, "nothing has changed");
+    node.shutdown("test over");
+}
+
+#[test]
+fn a_car_without_a_pit_wall_drives_and_ends_in_time() {
+    let wall = Wall::open();
+    let endpoint = wall.endpoint.clone();
+    drop(wall);
+    let nobody = Wall {
+        session: zenoh::open(client_of_nobody()).wait().expect("a session"),
+        endpoint,
+    };
+    let (node, _) = start("echo", &nobody, |_| ());
+    let until = Instant::now() + DEADLINE;
+    while node.shared().belief.lock().expect("unpoisoned").is_none() {
+        assert!(Instant::now() < until, "no pose");
+        std::thread::yield_now();
+    }
+    let before = Instant::now();
+    node.shutdown("test over");
+    assert!(before.elapsed() < Duration::from_secs(5));
+}
+
+fn client_of_nobody() -> Config {
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", r#""peer""#),
+        ("listen/endpoints", "[]"),
+        ("scouting/multicast/enabled", "false"),
+    ] {
+        config.insert_json5(key, value).expect("a setting");
+    }
+    config
+}

@@ -45,6 +45,7 @@
 //! }
 //! # Ok::<(), maps::RacelineFault>(())
 //! ```
+mod check;
 mod contour;
 mod driver;
 mod generator;
@@ -56,6 +57,7 @@ mod vehicle;
 mod walls;
 mod world;
 
+pub use check::TrackReport;
 pub use driver::{Ahead, Driver, DriverParams, Estimate, Manoeuvre};
 pub use generator::{
     BUNDLED, BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map,

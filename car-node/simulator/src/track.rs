@@ -72,4 +72,40 @@ impl Track {
         write("raceline.csv", self.raceline.to_csv().as_bytes())?;
         write("walls.csv", self.walls.to_csv().as_bytes())
     }
+
+    /// A track that ships, by name (one of [`BUNDLED`](crate::BUNDLED)). It is part of the program: no file is read.
+    pub fn bundled(name: &str) -> Option<Self> {
+        macro_rules! files {
+            ($name:literal) => {
+                [
+                    include_bytes!(concat!("../../../maps/tracks/", $name, "/map.yaml")).as_slice(),
+                    include_bytes!(concat!("../../../maps/tracks/", $name, "/map.png")),
+                    include_bytes!(concat!("../../../maps/tracks/", $name, "/raceline.csv")),
+                    include_bytes!(concat!("../../../maps/tracks/", $name, "/walls.csv")),
+                ]
+            };
+        }
+        let [yaml, png, line, walls] = match name {
+            "club" => files!("club"),
+            "hall" => files!("hall"),
+            "park" => files!("park"),
+            "mirror" => files!("mirror"),
+            _ => return None,
+        };
+        let text = |bytes| str::from_utf8(bytes).expect("bundled files are text");
+        Some(Self {
+            name: name.to_owned(),
+            grid: OccupancyGrid::from_parts(text(yaml), png).expect("bundled maps are valid"),
+            raceline: Raceline::parse(name, text(line)).expect("bundled racelines are valid"),
+            walls: Walls::parse(name, text(walls)).expect("bundled walls are valid"),
+        })
+    }
+
+    /// A bundled track by name, or else the one at that path.
+    pub fn find(name_or_path: &str) -> Result<Self, MapError> {
+        match Self::bundled(name_or_path) {
+            Some(track) => Ok(track),
+            None => Self::load(name_or_path),
+        }
+    }
 }

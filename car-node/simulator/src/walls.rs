@@ -252,7 +252,7 @@ impl Walls {
                 Surface::Black => "black",
             };
             for [x, y] in &wall.points {
-                writeln!(csv, "{i}; {surface}; {x:.4}; {y:.4}").expect("a string takes all");
+                writeln!(csv, "{i}; {surface}; {x:.3}; {y:.3}").expect("a string takes all");
             }
         }
         csv

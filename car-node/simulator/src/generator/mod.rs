@@ -2,6 +2,7 @@
 
 mod mapping;
 mod minimum_curvature;
+mod random;
 mod spec;
 mod speed_profile;
 mod spline;

@@ -12,7 +12,7 @@ use super::{LineError, MappingParams, SpeedParams, draw_map, minimum_curvature, 
 use crate::{Surface, Track, Wall, Walls};
 
 /// The tracks that ship, by name.
-pub const BUNDLED: [&str; 1] = ["club"];
+pub const BUNDLED: [&str; 4] = ["club", "hall", "park", "mirror"];
 
 /// Distance between the points of the centre line [m].
 const SPACING: f64 = 0.05;
@@ -290,9 +290,9 @@ fn rectangle(at: [f64; 2], size: [f64; 2], heading: f64) -> Wall {
     }
 }
 
-/// The polyline with the points left out that lie within half a millimetre of the rest (Douglas and Peucker, 1973).
+/// The polyline with the points left out that lie within a millimetre of the rest (Douglas and Peucker, 1973).
 fn simplified(points: &[[f64; 2]]) -> Vec<[f64; 2]> {
-    const TOLERANCE: f64 = 0.0005;
+    const TOLERANCE: f64 = 0.001;
     let (Some(&first), Some(&last)) = (points.first(), points.last()) else {
         return Vec::new();
     };
@@ -312,5 +312,80 @@ fn simplified(points: &[[f64; 2]]) -> Vec<[f64; 2]> {
             left
         }
         _ => vec![first, last],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const YAML: &str = "name: oval\nseed: 7\ncentre: [[0, 0], [4, -2], [8, 0], [8, 3], [4, 5], [0, 3]]\n\
+                        half_width: [0.8]\nmargin: 0.3\ntexture: 0.03\nposts: 1.0\n";
+
+    #[test]
+    fn the_same_description_makes_the_same_track() {
+        let spec = TrackSpec::parse("oval", YAML).expect("a valid description");
+        let [a, b] = [(); 2].map(|()| spec.generate().expect("room enough"));
+        assert_eq!(a.grid, b.grid);
+        assert_eq!(a.walls, b.walls);
+        assert_eq!(a.raceline, b.raceline);
+        let other = TrackSpec { seed: 8, ..spec }.generate().expect("room enough");
+        assert_ne!(a.walls, other.walls);
+    }
+
+    #[test]
+    fn a_point_symmetric_track_is_its_own_turned_image() {
+        let yaml = "name: s\nseed: 7\npoint_symmetric: true\ncentre: [[4, -2], [6, 0], [4, 2], [0, 1.5], [-2, 2]]\n\
+                    half_width: [0.7, 0.7, 0.7, 0.7, 0.9]\nmargin: 0.3\ntexture: 0.03\nposts: 2.0\n";
+        let track = TrackSpec::parse("s", yaml).and_then(|spec| {
+            spec.generate().map_err(|e| MapError::Format {
+                file: "s".into(),
+                fault: e.to_string(),
+            })
+        });
+        let track = track.expect("a valid description");
+        let line = &track.raceline;
+        for i in 0..200 {
+            let angle = f64::from(i) * 0.031;
+            let p = line.at(f64::from(i) * 0.1);
+            let there = track.walls.cast([p.x, p.y], [angle.cos(), angle.sin()], 30.0);
+            let turned = track.walls.cast([-p.x, -p.y], [-angle.cos(), -angle.sin()], 30.0);
+            let [a, b] = [there, turned].map(|hit| hit.map_or(30.0, |hit| hit.range));
+            // Sampling the curve and leaving out points within a millimetre differ a little between the halves.
+            assert!((a - b).abs() < 0.05, "at {i}: {a} and {b}");
+        }
+    }
+
+    #[test]
+    fn faults_name_the_key() {
+        for (from, to, expected) in [
+            ("margin: 0.3", "margin: .nan", "t.yaml: margin: NaN"),
+            (
+                "half_width: [0.8]",
+                "half_width: []",
+                "t.yaml: half_width: 0 values",
+            ),
+            (
+                "half_width: [0.8]",
+                "half_width: [0.1]",
+                "t.yaml: half_width: 0.1",
+            ),
+            ("[0, 3]]", "[0, .inf]]", "t.yaml: centre: "),
+            ("seed: 7", "seed: x", "t.yaml: "),
+            ("posts: 1.0", "poles: 1.0", "t.yaml: "),
+        ] {
+            let error = TrackSpec::parse("t.yaml", &YAML.replace(from, to)).expect_err("a fault");
+            assert!(
+                error.to_string().starts_with(expected),
+                "{error} should start with {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_block_on_the_line_is_where_it_is_too_narrow() {
+        let yaml = format!("{YAML}blocks: [{{ at: [4, -2], size: [1.2, 1.2] }}]\n");
+        let spec = TrackSpec::parse("oval", &yaml).expect("a valid description");
+        assert!(matches!(spec.generate(), Err(LineError::TooNarrow { .. })));
     }
 }

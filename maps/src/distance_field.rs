@@ -80,6 +80,92 @@ impl DistanceField {
         })
     }
 
+    /// The sample of the cell that holds a point in grid coordinates [m]; None outside the grid.
+    #[inline]
+    pub fn nearest(&self, u: f32, v: f32) -> Option<f32> {
+        if !(u >= 0.0 && v >= 0.0) {
+            return None;
+        }
+        let (column, row) = (u as usize, v as usize);
+        (column < self.width && row < self.height).then(|| self.values[row * self.width + column])
+    }
+
+    /// Path from `start` along the unit vector `direction` to the first wall's face [cells], at most `longest`
+    /// (sphere tracing; Hart, The Visual Computer 12, 1996). 0 if the start is not in free space.
+    pub fn trace(&self, start: [f32; 2], direction: [f32; 2], longest: f32) -> f32 {
+        let cells = 1.0 / self.resolution as f32;
+        let (mut path, mut before) = (0.0, None::<(f32, f32)>);
+        while path < longest {
+            let point = [start[0] + path * direction[0], start[1] + path * direction[1]];
+            let Some(sample) = self.sample(point[0], point[1]) else {
+                // The rim of half a cell, or the outside.
+                return path;
+            };
+            let distance = sample.distance * cells;
+            if distance <= 0.0 {
+                // Between the last step and this one the field is as good as linear.
+                return before
+                    .map_or(0.0, |(p, d)| p + (path - p) * d / (d - distance))
+                    .min(longest);
+            }
+            before = Some((path, distance));
+            // Not below a quarter of a cell, or a grazing ray creeps; a wall is thicker than that.
+            path += distance.max(0.25);
+        }
+        longest
+    }
+
+    /// The walls' faces: segments of the field's zero line in grid coordinates [cells], in no order (marching
+    /// squares; Lorensen and Cline, SIGGRAPH 1987, in the plane).
+    pub fn contour(&self) -> Vec<[[f32; 2]; 2]> {
+        let mut segments = Vec::new();
+        for row in 0..self.height.saturating_sub(1) {
+            for column in 0..self.width.saturating_sub(1) {
+                let i = row * self.width + column;
+                let corners = [
+                    self.values[i],
+                    self.values[i + 1],
+                    self.values[i + self.width + 1],
+                    self.values[i + self.width],
+                ];
+                let inside = corners.map(|value| value > 0.0);
+                if inside == [true; 4] || inside == [false; 4] {
+                    continue;
+                }
+                // Where the zero line crosses the square's four edges, counter-clockwise.
+                let places = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+                let mut crossings = [[0.0f32; 2]; 4];
+                let mut count = 0;
+                for edge in 0..4 {
+                    let next = (edge + 1) % 4;
+                    if inside[edge] != inside[next] {
+                        let t: f32 = corners[edge] / (corners[edge] - corners[next]);
+                        let [from, to]: [[f32; 2]; 2] = [places[edge], places[next]];
+                        let at = |axis: usize| from[axis] + t * (to[axis] - from[axis]);
+                        crossings[count] = [column as f32 + 0.5 + at(0), row as f32 + 0.5 + at(1)];
+                        count += 1;
+                    }
+                }
+                if count == 4 && inside[0] == (corners.iter().sum::<f32>() > 0.0) {
+                    // A saddle whose middle belongs to corners 0 and 2: the line goes around corners 1 and 3.
+                    segments.push([crossings[0], crossings[1]]);
+                    segments.push([crossings[2], crossings[3]]);
+                } else if count == 4 {
+                    segments.push([crossings[3], crossings[0]]);
+                    segments.push([crossings[1], crossings[2]]);
+                } else {
+                    segments.push([crossings[0], crossings[1]]);
+                }
+            }
+        }
+        segments
+    }
+
+    /// The samples, at the cells' centres, in the order of the grid's cells [m].
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
     /// Signed distance at a point of `map` [m]; 0 outside the grid, where nothing is known.
     pub fn distance(&self, point: [f64; 2]) -> f64 {
         let [u, v] = self
@@ -236,12 +322,44 @@ mod tests {
     }
 
     #[test]
+    fn the_contour_is_the_face() {
+        let segments = DistanceField::new(&drawn(&["......##", "......##", "......##"])).contour();
+        assert_eq!(segments.len(), 2);
+        assert!(
+            segments
+                .iter()
+                .flatten()
+                .all(|point| (point[0] - 6.0).abs() < 1e-6),
+            "{segments:?}"
+        );
+        // Two blocks that touch at a corner.
+        let saddle = DistanceField::new(&drawn(&["##..", "##..", "..##", "..##"])).contour();
+        assert!(saddle.len() >= 4);
+    }
+
+    #[test]
     fn the_unknown_behind_a_thin_wall_is_solid() {
         let field = DistanceField::new(&drawn(&["...#????", "...#????", "...#????"]));
         assert!(field.distance([5.5, 1.5]) < -2.0);
     }
 
     proptest! {
+        #[test]
+        fn traced_and_cast_ranges_agree(x in 2.0..18.0, y in 2.0..10.0, heading in -3.1f64..3.1) {
+            let cells = (0..20 * 12)
+                .map(|i| if matches!((i % 20, i / 20), (0 | 19, _) | (_, 0 | 11)) { Cell::Occupied } else { Cell::Free })
+                .collect();
+            let grid = OccupancyGrid::new(20, 12, 1.0, Pose::IDENTITY, cells);
+            let field = DistanceField::new(&grid);
+            let exact = grid.cast(Pose::new(x, y, heading), 50.0);
+            let traced = field.trace([x as f32, y as f32], [heading.cos() as f32, heading.sin() as f32], 50.0);
+            // Interpolation rounds the corners off within half a cell.
+            let end = [x + exact * heading.cos(), y + exact * heading.sin()];
+            let corner = (end[0] - 1.0).min(19.0 - end[0]).max((end[1] - 1.0).min(11.0 - end[1])) < 0.6;
+            let tolerance = if corner { 1.5 } else { 0.02 };
+            prop_assert!((exact - f64::from(traced)).abs() < tolerance, "{exact} {traced}");
+        }
+
         #[test]
         fn free_cells_hold_the_exact_distance(walls in proptest::collection::vec((0usize..12, 0usize..9), 1..20)) {
             let mut cells = vec![Cell::Free; 12 * 9];

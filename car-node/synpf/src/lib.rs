@@ -3,10 +3,34 @@
 //! Sensor data goes in ([`Localizer::on_odometry`], [`Localizer::on_scan`]), poses come out. The crate reads
 //! no file, no clock and no network, and every random number comes from the seed: the same seed and the
 //! same log give the same bytes.
+mod beams;
+mod cddt;
+mod defects;
 mod input;
 mod localizer;
+mod motion;
+mod odometry_track;
 mod parameters;
+mod particles;
+mod quality;
+mod range_table;
+mod recovery;
+mod refine;
+mod search;
+mod sensor;
+mod slip;
+mod track_map;
+mod weigh;
 
+pub use beams::{BeamLayout, BeamParameters};
+pub use defects::Defects;
 pub use input::{Odometry, Scan, Stamp, Twist, YawRate};
-pub use localizer::{Dropped, Localizer, Mode, SetUpError, TrackMap, Update, WeightedPose};
+pub use localizer::{Dropped, Hypothesis, Localizer, Mode, SetUpError, Tuning, Update, WeightedPose};
+pub use motion::{MotionModel, MotionParameters};
 pub use parameters::{ParameterFault, Parameters};
+pub use particles::ParticleParameters;
+pub use recovery::RecoveryParameters;
+pub use refine::RefinementParameters;
+pub use search::SearchParameters;
+pub use sensor::{RangeMethod, SensorModel, SensorParameters};
+pub use track_map::TrackMap;

@@ -1,49 +1,22 @@
 //! The localizer: sensors in, poses out.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 
-use maps::{OccupancyGrid, Pose};
-use nalgebra::Matrix3;
+use maps::Pose;
+use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, Twist, YawRate};
-
-/// A map made ready for localization: the grid, its distance field and its range table. Built once, shared
-/// between threads and between localizers.
-#[derive(Debug)]
-pub struct TrackMap {
-    grid: OccupancyGrid,
-}
-
-impl TrackMap {
-    /// Builds what the filter needs. Fails on a map without a free cell.
-    pub fn new(grid: OccupancyGrid) -> Result<Self, SetUpError> {
-        Ok(Self { grid })
-    }
-
-    /// The grid it was built from.
-    pub fn grid(&self) -> &OccupancyGrid {
-        &self.grid
-    }
-
-    /// Distance from a point of `map` to the nearest wall's face [m]; positive in free space.
-    pub fn distance(&self, point: [f64; 2]) -> f64 {
-        let _ = point;
-        0.0
-    }
-
-    /// Exact range that a laser at `map_from_laser` measures along its x axis [m], at most `max_range`.
-    pub fn range(&self, map_from_laser: Pose, max_range: f64) -> f64 {
-        let _ = map_from_laser;
-        max_range
-    }
-
-    /// Memory that the range table takes [bytes].
-    pub fn table_bytes(&self) -> usize {
-        0
-    }
-}
+use crate::beams::ReadyScan;
+use crate::motion::Motion;
+use crate::odometry_track::OdometryTrack;
+use crate::particles::{Belief, Particles};
+use crate::quality::Quality;
+use crate::recovery::Doubt;
+use crate::refine::{Estimate, fit, refine};
+use crate::search::Search;
+use crate::slip::{Slip, SlipWindow};
+use crate::weigh::{Ranges, Weigher};
+use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
 
 /// Why a localizer could not be set up.
 #[derive(Debug, thiserror::Error)]
@@ -144,7 +117,7 @@ pub struct Update {
     pub long_beams: f64,
     /// Share of the beams without a return.
     pub no_return: f64,
-    /// w_fast / w_slow of augmented MCL (Probabilistic Robotics, table 8.3); 1 when all is as usual.
+    /// `w_fast / w_slow` of augmented MCL (Probabilistic Robotics, table 8.3); 1 when all is as usual.
     pub w_ratio: f64,
     /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
     pub innovation: [f64; 2],
@@ -155,14 +128,62 @@ pub struct Update {
     pub yaw_rate_residual: f64,
 }
 
-/// SynPF. Not thread-safe by design: one thread owns it; the map is shared.
+/// A pose that a search has found, for the operator to choose from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// `map_from_base_link`.
+    pub pose: Pose,
+    /// Log-likelihood of the last scans there, less than or equal to 0.
+    pub score: f64,
+}
+
+/// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.
+const CARRY: f64 = 0.25;
+
+/// A pause between scans after which the motion is uncertain beyond its tuning [s].
+const GAP: f64 = 0.5;
+
+/// Reach at which predictions are compared by their fit [m].
+const FIT_REACH: f32 = 0.15;
+
+/// By how much the particles' mean must fit better than the estimate's own prediction to be preferred.
+const FIT_MARGIN: f64 = 0.08;
+
+/// SynPF. One thread owns it; the map is shared.
+///
+/// Inside, poses are in the grid's frame; see [`TrackMap`].
 #[derive(Debug)]
 pub struct Localizer {
     map: Arc<TrackMap>,
+    base_link_from_laser: Pose,
     parameters: Parameters,
-    pose: Option<Pose>,
-    odometry: VecDeque<Odometry>,
+    weigher: Weigher,
+    ranges: Option<(usize, Ranges)>,
+    track: OdometryTrack,
+    scan: ReadyScan,
+    particles: Particles,
+    mode: Mode,
+    /// The posterior at `at`, and odometry's pose there.
+    estimate: Estimate,
+    at: Option<(Stamp, Pose)>,
+    last_scan: Option<Stamp>,
     number: u64,
+    search: Search,
+    doubt: Doubt,
+    slip_window: SlipWindow,
+    slip: Slip,
+    w_ratio: f64,
+    /// Updates since the pose was set or found, while the doubt is not yet to be trusted.
+    settled: u32,
+    per_odometry: PerOdometry,
+}
+
+/// What `defect_update_per_odometry` keeps: odometry is applied one message late.
+#[derive(Debug, Default)]
+struct PerOdometry {
+    last: Option<Odometry>,
+    delayed: Pose,
+    have_scan: bool,
 }
 
 impl Localizer {
@@ -173,36 +194,105 @@ impl Localizer {
         parameters: Parameters,
         seed: u64,
     ) -> Result<Self, SetUpError> {
-        let _ = (base_link_from_laser, seed);
+        if !base_link_from_laser.is_finite() {
+            return Err(SetUpError::Pose(base_link_from_laser));
+        }
         parameters.validate().map_err(SetUpError::Parameters)?;
+        let weigher = Weigher::new(&parameters, map.grid().resolution);
+        let particles = Particles::new(seed, parameters.particles.max_particles);
         Ok(Self {
             map,
+            base_link_from_laser,
             parameters,
-            pose: None,
-            odometry: VecDeque::new(),
+            weigher,
+            ranges: None,
+            track: OdometryTrack::default(),
+            scan: ReadyScan::default(),
+            particles,
+            mode: Mode::Uninitialized,
+            estimate: Estimate {
+                pose: Pose::IDENTITY,
+                covariance: Matrix3::zeros(),
+            },
+            at: None,
+            last_scan: None,
             number: 0,
+            search: Search::default(),
+            doubt: Doubt::default(),
+            slip_window: SlipWindow::default(),
+            slip: Slip::default(),
+            w_ratio: 1.0,
+            settled: 0,
+            per_odometry: PerOdometry::default(),
         })
     }
 
-    /// Starts from a pose of `base_link` in `map`, true now (at the latest odometry), with the set's initial spread.
+    /// Starts from a pose of `base_link` in `map`, true at the latest odometry (or, before there is any, at the
+    /// first scan), with the set's initial spread.
     pub fn initialize(&mut self, pose: Pose) -> Result<(), SetUpError> {
         if !pose.is_finite() {
             return Err(SetUpError::Pose(pose));
         }
-        self.pose = Some(pose);
+        self.map.prepare(pose, &self.parameters);
+        let particles = &self.parameters.particles;
+        let sigma = [
+            particles.initial_std_x,
+            particles.initial_std_y,
+            particles.initial_std_heading,
+        ];
+        let pose = self.map.grid_from_map() * pose;
+        let covariance = Matrix3::from_diagonal(&Vector3::from(sigma.map(|s| s * s + 1e-8)));
+        self.start(Estimate { pose, covariance }, sigma);
+        self.at = self
+            .track
+            .latest()
+            .and_then(|stamp| Some((stamp, self.track.at(stamp, 0.0)?.0)));
         Ok(())
+    }
+
+    /// Takes an estimate in the grid's frame as the truth, with particles spread around it.
+    fn start(&mut self, estimate: Estimate, sigma: [f64; 3]) {
+        self.estimate = estimate;
+        self.particles
+            .scatter(self.parameters.particles.max_particles, estimate.pose, sigma);
+        self.mode = Mode::Tracking;
+        self.search = Search::default();
+        self.doubt.clear();
+        self.slip_window.clear();
+        self.slip = Slip::default();
+        self.settled = 0;
     }
 
     /// Forgets the pose and searches the whole map with the next scans.
     pub fn relocalize(&mut self) {
-        self.pose = None;
+        self.mode = Mode::Searching;
+        self.search = Search::default();
+        self.doubt.clear();
+        self.slip_window.clear();
     }
 
-    /// Swaps the parameter set between two updates; the particles stay. On `Err` nothing has changed.
+    /// The poses that a search under way has found, best first; empty when none is.
+    pub fn hypotheses(&self) -> Vec<Hypothesis> {
+        let map_from_grid = self.map.grid().origin;
+        let public = |candidate: &crate::search::Candidate| Hypothesis {
+            pose: map_from_grid * candidate.estimate.pose,
+            score: candidate.score,
+        };
+        self.search.candidates.iter().map(public).collect()
+    }
+
+    /// Swaps the parameter set between two updates; the particles stay. On `Err` nothing has changed. Builds the
+    /// tables of the sensor model, which takes some milliseconds; see [`Localizer::tune`] to have that done elsewhere.
     pub fn set_parameters(&mut self, parameters: Parameters) -> Result<(), Vec<ParameterFault>> {
-        parameters.validate()?;
-        self.parameters = parameters;
+        self.tune(Tuning::new(parameters, &self.map)?);
         Ok(())
+    }
+
+    /// Swaps in a parameter set made ready on another thread; takes no time.
+    pub fn tune(&mut self, tuning: Tuning) {
+        self.parameters = tuning.parameters;
+        self.weigher = tuning.weigher;
+        self.ranges = None;
     }
 
     /// The set in force.
@@ -217,66 +307,359 @@ impl Localizer {
 
     /// Takes in odometry. Cheap.
     pub fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
-        if !odometry.pose.is_finite() {
-            return Err(Dropped::Malformed);
+        self.track.push(odometry, self.parameters.motion.use_imu)?;
+        if self.parameters.defects.defect_update_per_odometry {
+            self.update_per_odometry(odometry);
         }
-        if let Some(last) = self.odometry.back() {
-            if odometry.stamp <= last.stamp {
-                return Err(Dropped::TimeBackwards);
-            }
-            self.pose = self.pose.map(|pose| pose * odometry.pose.since(last.pose));
-        }
-        self.odometry.clear();
-        self.odometry.push_back(*odometry);
         Ok(())
     }
 
     /// Takes in a gyroscope's reading; used in place of odometry's yaw rate where the set says so. Cheap.
     pub fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        if yaw_rate.rate.is_finite() {
-            Ok(())
+        self.track.push_yaw_rate(yaw_rate)
+    }
+
+    /// The whole update: move, weigh, refine, judge, resample.
+    pub fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {
+        if self.last_scan.is_some_and(|last| scan.stamp <= last) {
+            return Err(Dropped::TimeBackwards);
+        }
+        let latest = self.track.latest().ok_or(Dropped::NoOdometry)?;
+        if scan.stamp.since(latest) > CARRY {
+            return Err(Dropped::StaleOdometry);
+        }
+        let (odom, twist) = self.track.at(scan.stamp, CARRY).ok_or(Dropped::NoOdometry)?;
+        let max_range = self.parameters.sensor.max_range;
+        self.scan.load(
+            scan,
+            &self.track,
+            self.base_link_from_laser,
+            max_range,
+            &self.parameters.beams,
+        )?;
+        self.last_scan = Some(scan.stamp);
+        if self.parameters.defects.defect_update_per_odometry && self.mode == Mode::Tracking {
+            return self.latest_of_odometry();
+        }
+        let (before, odom_before) = self.at.unwrap_or((scan.stamp, odom));
+        let seconds = scan.stamp.since(before);
+        if seconds < 0.0 {
+            return Err(Dropped::TimeBackwards);
+        }
+        let motion = odom.since(odom_before);
+        match self.mode {
+            Mode::Uninitialized => return Err(Dropped::NotInitialized),
+            Mode::Tracking => {}
+            Mode::Searching => {
+                self.at = Some((scan.stamp, odom));
+                let found = self
+                    .search
+                    .update(&self.map, &self.scan, motion, seconds, &self.parameters);
+                if let Some(estimate) = found {
+                    self.start(estimate, [0.1, 0.1, 0.05]);
+                    return Ok(self.report(scan.stamp, twist, None, [0.0; 2]));
+                }
+                if let Some(best) = self.search.candidates.first() {
+                    self.estimate = best.estimate;
+                }
+                return Ok(self.report(scan.stamp, twist, None, [0.0; 2]));
+            }
+        }
+        let update = self.follow(scan.stamp, seconds, motion, twist);
+        self.at = Some((scan.stamp, odom));
+        Ok(update)
+    }
+
+    /// One update of the pose that is followed.
+    fn follow(&mut self, stamp: Stamp, seconds: f64, motion: Pose, twist: Twist) -> Update {
+        let widen = self.widen(seconds);
+        let parameters = &self.parameters;
+        let noise = self.noise(motion, seconds, widen);
+        let predicted = self.estimate.moved(motion, &noise);
+
+        self.particles.advance(&Motion::new(
+            motion,
+            seconds,
+            widen,
+            &parameters.motion,
+            parameters.defects,
+        ));
+        self.weigh(predicted.pose);
+        let sound = self.particles.normalize();
+        let belief = self.particles.belief();
+
+        let before = self.estimate.pose;
+        self.estimate = if self.parameters.refinement.refine && sound {
+            self.refined(&predicted, &belief)
         } else {
-            Err(Dropped::Malformed)
+            Estimate {
+                pose: belief.mean,
+                covariance: belief.covariance,
+            }
+        };
+        let innovation = [
+            self.estimate.pose.distance(predicted.pose),
+            maps::wrap_angle(self.estimate.pose.heading - predicted.pose.heading).abs(),
+        ];
+        if seconds > 0.0 {
+            self.slip_window
+                .push(stamp, seconds, motion, self.estimate.pose.since(before));
+            self.slip = self.slip_window.slip();
+        }
+        self.report(stamp, twist, Some((belief, seconds)), innovation)
+    }
+
+    /// By how much the noise is wider than tuned: after a pause, and with slip where the set adapts.
+    fn widen(&self, seconds: f64) -> f64 {
+        let pause = if seconds > GAP { 3.0 } else { 1.0 };
+        if !self.parameters.motion.adaptive {
+            return pause;
+        }
+        let slip = self.slip.ratio.abs() / 0.05 + self.slip.yaw_rate.abs() / 0.5;
+        pause * (1.0 + slip).min(4.0)
+    }
+
+    /// Uncertainty of a motion in the frame of its start, for the refined estimate.
+    fn noise(&self, motion: Pose, seconds: f64, widen: f64) -> Matrix3<f64> {
+        let p = &self.parameters.motion;
+        let distance = motion.x.hypot(motion.y);
+        let steady = [
+            p.diffusion_xy.powi(2) * seconds,
+            p.diffusion_heading.powi(2) * seconds,
+        ];
+        let along = (p.odometry_speed_error * distance * widen).powi(2) + steady[0];
+        let across = (p.odometry_side_error * distance * widen).powi(2) + steady[0];
+        let turn = (p.odometry_yaw_error * motion.heading * widen).powi(2) + steady[1];
+        Matrix3::from_diagonal(&Vector3::new(along, across, turn))
+    }
+
+    /// Adds the scan's log-likelihood to the particles, with the ranges of the region that the car is in.
+    fn weigh(&mut self, near: Pose) {
+        let region = self.map.region_at(near);
+        let known = self.ranges.as_ref().map(|(of, _)| *of);
+        let index = region.unwrap_or_else(|| known.unwrap_or(usize::MAX));
+        if known != Some(index) {
+            self.ranges = Some((index, self.weigher.ranges(&self.map, region, &self.parameters)));
+        }
+        if let Some((_, ranges)) = &self.ranges {
+            self.weigher.weigh(
+                &mut self.particles,
+                &self.scan,
+                &self.map,
+                ranges,
+                self.base_link_from_laser,
+            );
         }
     }
 
-    /// The whole update: move, weigh, resample, estimate.
-    pub fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {
-        let odometry = self.odometry.back().ok_or(Dropped::NoOdometry)?;
-        let pose = self.pose.ok_or(Dropped::NotInitialized)?;
+    /// The scan fitted around the prediction, or around the particles where they explain the scan better.
+    fn refined(&self, predicted: &Estimate, belief: &Belief) -> Estimate {
+        let parameters = &self.parameters.refinement;
+        let field = self.map.field();
+        let fit = |pose| fit(field, &self.scan.points, 60, pose, FIT_REACH);
+        let particles = Estimate {
+            pose: belief.mean,
+            covariance: belief.covariance + Matrix3::identity() * 1e-4,
+        };
+        let own = fit(predicted.pose);
+        let from_predicted = refine(field, &self.scan.points, predicted.pose, predicted, parameters);
+        let own_refined = fit(from_predicted.pose);
+        if fit(particles.pose) > own.max(own_refined) + FIT_MARGIN {
+            let from_particles = refine(field, &self.scan.points, particles.pose, &particles, parameters);
+            if fit(from_particles.pose) > own_refined + FIT_MARGIN {
+                return from_particles;
+            }
+        }
+        // A fit that made things worse has run away.
+        if own_refined + FIT_MARGIN < own {
+            *predicted
+        } else {
+            from_predicted
+        }
+    }
+
+    /// Judges the estimate, decides on searching and resampling, and says how it went.
+    fn report(
+        &mut self,
+        stamp: Stamp,
+        twist: Twist,
+        belief: Option<(Belief, f64)>,
+        innovation: [f64; 2],
+    ) -> Update {
         self.number += 1;
-        Ok(Update {
-            stamp: scan.stamp,
+        let quality = Quality::new(
+            &self.map,
+            &self.scan,
+            self.estimate.pose,
+            self.base_link_from_laser,
+        );
+        let (mut spread, mut ess_ratio, mut second_mode) = ([0.0; 2], 1.0, 0.0);
+        if let Some((belief, seconds)) = belief {
+            spread = along_and_across(&belief.covariance, belief.mean.heading);
+            ess_ratio = belief.ess_ratio;
+            if spread[0].max(spread[1]) > 0.2 {
+                second_mode = self.particles.second_mode();
+            }
+            self.settled = self.settled.saturating_add(1);
+            let recovery = &self.parameters.recovery;
+            self.w_ratio = self.doubt.push(quality.alignment.max(0.02), recovery);
+            let lost = self.settled > 10
+                && self
+                    .doubt
+                    .lost(quality.alignment, quality.long, quality.short, seconds, recovery);
+            if lost && recovery.recover {
+                self.relocalize();
+            } else {
+                self.resample(ess_ratio);
+            }
+        }
+        let map_from_grid = self.map.grid().origin;
+        let (sin, cos) = map_from_grid.heading.sin_cos();
+        let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
+        Update {
+            stamp,
             number: self.number,
-            pose,
-            twist: odometry.twist,
-            covariance: Matrix3::identity() * 0.01,
-            mode: Mode::Tracking,
-            particles: self.parameters.max_particles,
-            ess_ratio: 1.0,
-            spread: [0.0; 2],
-            second_mode: 0.0,
-            alignment: 1.0,
-            residual: 0.0,
-            short_beams: 0.0,
-            long_beams: 0.0,
-            no_return: 0.0,
-            w_ratio: 1.0,
-            innovation: [0.0; 2],
-            slip: 0.0,
-            yaw_rate_residual: 0.0,
-        })
+            pose: map_from_grid * self.estimate.pose,
+            twist,
+            covariance: turn * self.estimate.covariance * turn.transpose(),
+            mode: self.mode,
+            particles: self.particles.len(),
+            ess_ratio,
+            spread,
+            second_mode,
+            alignment: quality.alignment,
+            residual: quality.residual,
+            short_beams: quality.short,
+            long_beams: quality.long,
+            no_return: self.scan.no_return,
+            w_ratio: self.w_ratio,
+            innovation,
+            slip: self.slip.ratio,
+            yaw_rate_residual: self.slip.yaw_rate,
+        }
+    }
+
+    /// Resamples when the weights have become uneven, feeding the refined estimate back, and injecting particles
+    /// along the track when the fit has fallen.
+    fn resample(&mut self, ess_ratio: f64) {
+        let parameters = &self.parameters;
+        if ess_ratio > parameters.particles.resample_ess_ratio {
+            return;
+        }
+        let count = self.particles.wanted(&parameters.particles);
+        self.particles.resample(count);
+        let mut next = 0;
+        if parameters.refinement.refine {
+            let share = (parameters.refinement.refine_feedback * count as f64) as usize;
+            let floor = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-5));
+            if let Some(root) = (self.estimate.covariance + floor).cholesky() {
+                let root = root.l();
+                for i in 0..share {
+                    let pose = self.particles.draw(self.estimate.pose, &root);
+                    self.particles.replace(i, pose);
+                }
+                next = share;
+            }
+        }
+        let recovery = &parameters.recovery;
+        if recovery.injection && self.w_ratio < recovery.injection_ratio {
+            let share = (recovery.injection_share * (1.0 - self.w_ratio) * count as f64) as usize;
+            // Along the track the estimate is most often wrong: slip, and walls without features.
+            let along = Matrix3::from_diagonal(&Vector3::new(1.0, 0.2, 0.1));
+            let (sin, cos) = self.estimate.pose.heading.sin_cos();
+            let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
+            for i in next..(next + share).min(count) {
+                let pose = self.particles.draw(self.estimate.pose, &(turn * along));
+                self.particles.replace(i, pose);
+            }
+        }
+    }
+
+    /// The reference's cycle: one update per odometry message, with the latest scan and the motion before the last.
+    fn update_per_odometry(&mut self, odometry: &Odometry) {
+        let last = self.per_odometry.last.replace(*odometry);
+        let Some(last) = last else { return };
+        let motion = std::mem::replace(&mut self.per_odometry.delayed, odometry.pose.since(last.pose));
+        if self.mode != Mode::Tracking || !self.per_odometry.have_scan {
+            return;
+        }
+        let seconds = odometry.stamp.since(last.stamp);
+        let still = self.parameters.defects.defect_deadband && motion.x.hypot(motion.y) < 0.01;
+        if !still {
+            let parameters = &self.parameters;
+            self.particles.advance(&Motion::new(
+                motion,
+                seconds,
+                1.0,
+                &parameters.motion,
+                parameters.defects,
+            ));
+        }
+        self.particles.log_weight.fill(0.0);
+        self.weigh(self.estimate.pose);
+        self.particles.normalize();
+        let belief = self.particles.belief();
+        self.estimate = Estimate {
+            pose: belief.mean,
+            covariance: belief.covariance,
+        };
+        let count = self.parameters.particles.max_particles;
+        self.particles.resample(count);
+        self.at = Some((odometry.stamp, odometry.pose));
+    }
+
+    /// What the reference would publish at a scan: the result of the latest odometry.
+    fn latest_of_odometry(&mut self) -> Result<Update, Dropped> {
+        self.per_odometry.have_scan = true;
+        let last = self.per_odometry.last.ok_or(Dropped::NoOdometry)?;
+        Ok(self.report(last.stamp, last.twist, None, [0.0; 2]))
     }
 
     /// The latest posterior carried forward to `stamp` by the odometry since, for publishing at odometry rate.
-    /// None before the first pose.
+    /// None before the first update.
     pub fn predict(&self, stamp: Stamp) -> Option<Pose> {
-        let _ = stamp;
-        self.pose
+        let (_, odom_then) = self.at?;
+        let (odom, _) = self.track.at(stamp, CARRY)?;
+        Some(self.map.grid().origin * self.estimate.pose * odom.since(odom_then))
     }
 
     /// The particles with their weights, at the latest update's stamp.
     pub fn particles(&self) -> impl Iterator<Item = WeightedPose> + '_ {
-        self.pose.iter().map(|&pose| WeightedPose { pose, weight: 1.0 })
+        let map_from_grid = self.map.grid().origin;
+        let p = &self.particles;
+        (0..p.len()).map(move |i| WeightedPose {
+            pose: map_from_grid * Pose::new(p.x[i].into(), p.y[i].into(), p.heading[i].into()),
+            weight: p.weight[i].into(),
+        })
     }
+
+    /// Jumps of odometry's pose that were taken out so far.
+    pub fn odometry_jumps(&self) -> u64 {
+        self.track.jumps
+    }
+}
+
+/// A parameter set with the tables that it needs, made ready away from the filter's loop.
+#[derive(Debug, Clone)]
+pub struct Tuning {
+    parameters: Parameters,
+    weigher: Weigher,
+}
+
+impl Tuning {
+    /// Validates a set and builds its tables. Every fault is listed.
+    pub fn new(parameters: Parameters, map: &TrackMap) -> Result<Self, Vec<ParameterFault>> {
+        parameters.validate()?;
+        let weigher = Weigher::new(&parameters, map.grid().resolution);
+        Ok(Self { parameters, weigher })
+    }
+}
+
+/// Standard deviations along and across a heading [m].
+fn along_and_across(covariance: &Matrix3<f64>, heading: f64) -> [f64; 2] {
+    let (sin, cos) = heading.sin_cos();
+    let (xx, xy, yy) = (covariance[(0, 0)], covariance[(0, 1)], covariance[(1, 1)]);
+    let along = cos * cos * xx + 2.0 * sin * cos * xy + sin * sin * yy;
+    let across = sin * sin * xx - 2.0 * sin * cos * xy + cos * cos * yy;
+    [along.max(0.0).sqrt(), across.max(0.0).sqrt()]
 }

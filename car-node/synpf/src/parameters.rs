@@ -1,6 +1,24 @@
 //! Parameter sets: what can be tuned, the sets that ship, and the reference's own file format.
+//!
+//! On disk and on the wire a set is flat: one key, one value. In the code each group of parameters belongs to
+//! the model that is built from it.
+
+mod reference;
+mod sets;
+
+use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::beams::BeamParameters;
+use crate::defects::Defects;
+use crate::motion::MotionParameters;
+use crate::particles::ParticleParameters;
+use crate::recovery::RecoveryParameters;
+use crate::refine::RefinementParameters;
+use crate::search::SearchParameters;
+use crate::sensor::SensorParameters;
 
 /// What is wrong with one parameter.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -13,17 +31,32 @@ pub struct ParameterFault {
 }
 
 /// Everything that can be tuned.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Parameters {
-    /// Most particles in use.
-    pub max_particles: usize,
-}
-
-impl Default for Parameters {
-    fn default() -> Self {
-        Self { max_particles: 3000 }
-    }
+    /// How many particles, and when they are resampled.
+    #[serde(flatten)]
+    pub particles: ParticleParameters,
+    /// Which beams are weighed, and how a scan is brought to one time.
+    #[serde(flatten)]
+    pub beams: BeamParameters,
+    /// How likely a range is.
+    #[serde(flatten)]
+    pub sensor: SensorParameters,
+    /// How the car moves, and how far to trust odometry.
+    #[serde(flatten)]
+    pub motion: MotionParameters,
+    /// The fit of the whole scan to the distance field.
+    #[serde(flatten)]
+    pub refinement: RefinementParameters,
+    /// What is done when the filter doubts itself.
+    #[serde(flatten)]
+    pub recovery: RecoveryParameters,
+    /// The search of the whole map.
+    #[serde(flatten)]
+    pub search: SearchParameters,
+    /// The reference's defects, all off but in `synpf-baseline`.
+    #[serde(flatten)]
+    pub defects: Defects,
 }
 
 impl Parameters {
@@ -32,19 +65,173 @@ impl Parameters {
 
     /// A set that ships, by name.
     pub fn named(name: &str) -> Option<Self> {
-        Self::NAMES.contains(&name).then(Self::default)
+        sets::named(name)
+    }
+
+    /// The set as flat keys and values, sorted by key.
+    pub fn to_values(&self) -> BTreeMap<String, Value> {
+        match serde_json::to_value(self) {
+            Ok(Value::Object(values)) => values.into_iter().collect(),
+            _ => unreachable!("a parameter set is a flat table of numbers, names and flags"),
+        }
+    }
+
+    /// This set with some values replaced. Returns the keys that mean nothing here beside it, for the caller to
+    /// warn of or to refuse. Every fault is listed, not just the first.
+    pub fn with_values(
+        &self,
+        given: impl IntoIterator<Item = (String, Value)>,
+    ) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
+        let base = self.to_values();
+        let (mut values, mut unknown, mut faults) = (base.clone(), Vec::new(), Vec::new());
+        for (key, value) in given {
+            if !base.contains_key(&key) {
+                unknown.push(key);
+                continue;
+            }
+            // Each value alone on top of a sound set, so that a fault names its key.
+            let mut one = base.clone();
+            one.insert(key.clone(), value.clone());
+            match from_values(one) {
+                Ok(_) => {
+                    values.insert(key, value);
+                }
+                Err(e) => faults.push(ParameterFault {
+                    fault: format!("{value}: {e}"),
+                    key,
+                }),
+            }
+        }
+        let set = match from_values(values) {
+            Ok(set) if faults.is_empty() => set,
+            Ok(_) => return Err(faults),
+            Err(e) => {
+                faults.push(ParameterFault {
+                    key: "set".into(),
+                    fault: e.to_string(),
+                });
+                return Err(faults);
+            }
+        };
+        set.validate()?;
+        Ok((set, unknown))
     }
 
     /// Reads a flat YAML file: our own keys, or those of the reference's `pf2_params.yaml` (bare, or under
-    /// `<node>: ros__parameters:`). Keys not given keep the value they have in `hq`. Returns the set and the
-    /// keys that mean nothing here, for a warning. Faults are listed whole.
+    /// `<node>: ros__parameters:`). Keys not given keep the value they have in `hq`; a file with the reference's
+    /// keys starts from `synpf-baseline` with its defects mended. Returns the set and the keys that mean nothing
+    /// here, for a warning. Faults are listed whole.
     pub fn from_yaml(text: &str) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
-        let _ = text;
-        Ok((Self::default(), Vec::new()))
+        let file: Value = serde_saphyr::from_str(text).map_err(|e| {
+            vec![ParameterFault {
+                key: "file".into(),
+                fault: e.to_string(),
+            }]
+        })?;
+        let Some(given) = reference::parameter_table(&file) else {
+            let fault = "should be a table of keys and values".to_owned();
+            return Err(vec![ParameterFault {
+                key: "file".into(),
+                fault,
+            }]);
+        };
+        let base = Self::named("hq").expect("hq ships");
+        base.with_values(
+            given
+                .iter()
+                .flat_map(|(key, value)| reference::translate(key, value)),
+        )
     }
 
     /// Every value that is out of its range, or contradicts another.
     pub fn validate(&self) -> Result<(), Vec<ParameterFault>> {
-        Ok(())
+        let mut check = Check(Vec::new());
+        self.particles.validate(&mut check);
+        self.beams.validate(&mut check);
+        self.sensor.validate(&mut check);
+        self.motion.validate(&mut check);
+        self.refinement.validate(&mut check);
+        self.recovery.validate(&mut check);
+        self.search.validate(&mut check);
+        if check.0.is_empty() { Ok(()) } else { Err(check.0) }
+    }
+}
+
+fn from_values(values: BTreeMap<String, Value>) -> serde_json::Result<Parameters> {
+    serde_json::from_value(Value::Object(values.into_iter().collect()))
+}
+
+/// Collects faults, so that a set is refused whole with all of them.
+pub(crate) struct Check(Vec<ParameterFault>);
+
+impl Check {
+    /// `value` must be a number in `[low, high]`.
+    pub(crate) fn range(&mut self, key: &str, value: f64, low: f64, high: f64) {
+        self.that(key, (low..=high).contains(&value), || {
+            format!("{value} is not in [{low}, {high}]")
+        });
+    }
+
+    /// `condition` must hold; else `fault` says what does not.
+    pub(crate) fn that(&mut self, key: &str, condition: bool, fault: impl FnOnce() -> String) {
+        if !condition {
+            self.0.push(ParameterFault {
+                key: key.into(),
+                fault: fault(),
+            });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_sets_that_ship_are_valid_and_differ() {
+        let sets: Vec<_> = Parameters::NAMES
+            .iter()
+            .map(|name| Parameters::named(name).expect(name))
+            .collect();
+        for (i, set) in sets.iter().enumerate() {
+            assert_eq!(set.validate(), Ok(()), "{}", Parameters::NAMES[i]);
+            assert!(
+                sets[..i].iter().all(|other| other != set),
+                "{}",
+                Parameters::NAMES[i]
+            );
+        }
+        assert_eq!(Parameters::named("wet"), None);
+    }
+
+    #[test]
+    fn values_there_and_back_are_the_same_set() {
+        for name in Parameters::NAMES {
+            let set = Parameters::named(name).expect(name);
+            let (back, unknown) = Parameters::default().with_values(set.to_values()).expect("sound");
+            assert_eq!((back, unknown), (set, Vec::new()));
+        }
+    }
+
+    #[test]
+    fn every_fault_is_listed_with_its_key() {
+        let keys = |text: &str| -> Vec<String> {
+            let faults = Parameters::from_yaml(text).expect_err("faulty");
+            faults.into_iter().map(|fault| fault.key).collect()
+        };
+        // What is no value at all comes first: ranges can only be checked in a set of sound types.
+        assert_eq!(
+            keys("max_particles: many\nmotion_model: warp\nz_hit: 0.8\n"),
+            ["max_particles", "motion_model"]
+        );
+        assert_eq!(keys("sigma_hit: 0\nmax_range: -3\n"), ["sigma_hit", "max_range"]);
+        assert_eq!(keys("sigma_hit: .nan\n"), ["file"]);
+    }
+
+    #[test]
+    fn unknown_keys_are_listed() {
+        let (set, unknown) = Parameters::from_yaml("z_hit: 0.8\nspeed_of_light: 3\n").expect("sound");
+        assert_eq!(unknown, ["speed_of_light"]);
+        assert!((set.sensor.z_hit - 0.8).abs() < 1e-12);
     }
 }

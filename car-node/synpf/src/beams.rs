@@ -1,0 +1,432 @@
+//! From a scan to what the filter weighs and fits: end points at one time, and a choice of beams.
+
+use maps::Pose;
+use serde::{Deserialize, Serialize};
+
+use crate::odometry_track::OdometryTrack;
+use crate::parameters::Check;
+use crate::{Dropped, Scan};
+
+/// How the beams to weigh are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BeamLayout {
+    /// At equal spacing along the outline of a corridor (Stahl et al., IV 2019): more beams look ahead, where
+    /// the information on the way along the track is.
+    Boxed,
+    /// At equal angles.
+    Uniform,
+}
+
+/// Parameters of the choice of beams.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct BeamParameters {
+    /// How they are chosen.
+    pub beam_layout: BeamLayout,
+    /// How many are weighed.
+    pub beams: usize,
+    /// Length over width of the corridor of the boxed layout.
+    pub lidar_aspect_ratio: f64,
+    /// Bring each beam to the scan's stamp by the odometry since; else all count as measured at once.
+    pub deskew: bool,
+}
+
+impl Default for BeamParameters {
+    fn default() -> Self {
+        Self {
+            beam_layout: BeamLayout::Boxed,
+            beams: 21,
+            lidar_aspect_ratio: 3.5,
+            deskew: true,
+        }
+    }
+}
+
+impl BeamParameters {
+    pub(crate) fn validate(&self, check: &mut Check) {
+        check.range("beams", self.beams as f64, 3.0, 1000.0);
+        check.range("lidar_aspect_ratio", self.lidar_aspect_ratio, 0.1, 100.0);
+    }
+}
+
+/// One beam at the scan's stamp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Beam {
+    /// Direction in the laser's frame at the scan's stamp [rad].
+    pub(crate) angle: f32,
+    /// Range from there [m]; infinite for no return.
+    pub(crate) range: f32,
+}
+
+/// A scan made ready. Buffers are kept from scan to scan.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct ReadyScan {
+    /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp [m], in order.
+    pub(crate) points: Vec<[f32; 2]>,
+    /// For each end point the index of its beam.
+    pub(crate) beam_of: Vec<u32>,
+    /// The beams to weigh.
+    pub(crate) beams: Vec<Beam>,
+    /// Share of all beams without a return.
+    pub(crate) no_return: f64,
+    /// The geometry that `directions` and `chosen` are for.
+    geometry: Option<(usize, f64, f64, BeamParameters)>,
+    /// Cosine and sine of each beam's angle.
+    directions: Vec<[f32; 2]>,
+    /// Indices of the beams to weigh.
+    chosen: Vec<u32>,
+    /// Which beams have a point, for those to weigh: its index, or none.
+    point_of: Vec<u32>,
+}
+
+/// Most beams of a scanner that we believe in: 0.05 deg all around, twice.
+const MOST_BEAMS: usize = 14_400;
+
+/// Odometry is interpolated for this many stretches of the sweep; in between the motion is as good as straight.
+const STRETCHES: usize = 8;
+
+const NO_POINT: u32 = u32::MAX;
+
+impl ReadyScan {
+    /// Makes a scan ready. Readings that are not finite, below `range_min` or from `range_max` (or
+    /// `max_range`) on are no returns. A scan may differ in geometry from the one before.
+    pub(crate) fn load(
+        &mut self,
+        scan: &Scan,
+        track: &OdometryTrack,
+        base_link_from_laser: Pose,
+        max_range: f64,
+        parameters: &BeamParameters,
+    ) -> Result<(), Dropped> {
+        let count = scan.ranges.len();
+        let sweep = scan.time_increment * count as f64;
+        let sound = (1..=MOST_BEAMS).contains(&count)
+            && scan.angle_min.is_finite()
+            && scan.angle_min.abs() < 100.0
+            && scan.angle_increment.is_finite()
+            && scan.angle_increment.abs() > 1e-6
+            && (scan.angle_increment * (count - 1) as f64).abs() < 6.5
+            && sweep.is_finite()
+            && (0.0..1.0).contains(&sweep)
+            && !scan.range_min.is_nan()
+            && !scan.range_max.is_nan();
+        if !sound {
+            return Err(Dropped::Malformed);
+        }
+        self.choose(scan, parameters);
+        let nearest = (scan.range_min as f32).max(0.01);
+        let farthest = scan.range_max.min(max_range) as f32;
+
+        self.points.clear();
+        self.beam_of.clear();
+        self.point_of.clear();
+        self.point_of.resize(count, NO_POINT);
+        let deskew = parameters.deskew && sweep > 1e-4;
+        let stretch = if deskew { count.div_ceil(STRETCHES) } else { count };
+        let (mut begin, mut start) = (0, base_link_from_laser);
+        let at_stamp = track.at(scan.stamp, sweep + 0.1).map(|(pose, _)| pose.inverse());
+        while begin < count {
+            let end = (begin + stretch).min(count);
+            // The laser's pose at the end of the stretch, seen from base_link at the scan's stamp.
+            let finish = match at_stamp {
+                Some(from_odom) if deskew => {
+                    let time = scan.stamp.plus(scan.time_increment * end as f64);
+                    track
+                        .at(time, sweep + 0.1)
+                        .map_or(start, |(pose, _)| from_odom * pose * base_link_from_laser)
+                }
+                _ => base_link_from_laser,
+            };
+            self.transform(scan, begin..end, start, finish, nearest..farthest);
+            (begin, start) = (end, finish);
+        }
+        self.no_return = 1.0 - self.points.len() as f64 / count as f64;
+        if self.points.is_empty() {
+            return Err(Dropped::NoBeams);
+        }
+        self.weighed(base_link_from_laser);
+        Ok(())
+    }
+
+    /// End points of one stretch of beams while the laser moves from `start` to `finish`.
+    fn transform(
+        &mut self,
+        scan: &Scan,
+        beams: std::ops::Range<usize>,
+        start: Pose,
+        finish: Pose,
+        valid: std::ops::Range<f32>,
+    ) {
+        let per_beam = 1.0 / beams.len() as f32;
+        let (sin, cos) = start.heading.sin_cos();
+        let (sin, cos) = (sin as f32, cos as f32);
+        let (x, y) = (start.x as f32, start.y as f32);
+        let (dx, dy) = (
+            (finish.x - start.x) as f32 * per_beam,
+            (finish.y - start.y) as f32 * per_beam,
+        );
+        let turn = maps::wrap_angle(finish.heading - start.heading) as f32 * per_beam;
+        let ranges = &scan.ranges[beams.clone()];
+        for (k, (&range, direction)) in ranges.iter().zip(&self.directions[beams.clone()]).enumerate() {
+            // False for NaN.
+            if !(range >= valid.start && range < valid.end) {
+                continue;
+            }
+            let step = k as f32;
+            let angle = turn * step;
+            let (c, s) = (
+                cos * direction[0] - sin * direction[1],
+                sin * direction[0] + cos * direction[1],
+            );
+            // A stretch turns by a few hundredths of a radian: second order is exact to a micrometre.
+            let half = 1.0 - 0.5 * angle * angle;
+            let (c, s) = (c * half - s * angle, s * half + c * angle);
+            let beam = (beams.start + k) as u32;
+            self.point_of[beam as usize] = self.points.len() as u32;
+            self.points
+                .push([x + dx * step + range * c, y + dy * step + range * s]);
+            self.beam_of.push(beam);
+        }
+    }
+
+    /// The beams to weigh, as the laser at the scan's stamp would have measured them.
+    fn weighed(&mut self, base_link_from_laser: Pose) {
+        let laser_from_base_link = base_link_from_laser.inverse();
+        let (sin, cos) = laser_from_base_link.heading.sin_cos();
+        let (sin, cos) = (sin as f32, cos as f32);
+        let (x, y) = (laser_from_base_link.x as f32, laser_from_base_link.y as f32);
+        self.beams.clear();
+        for &beam in &self.chosen {
+            let point = self.point_of[beam as usize];
+            self.beams.push(if point == NO_POINT {
+                let [c, s] = self.directions[beam as usize];
+                Beam {
+                    angle: s.atan2(c),
+                    range: f32::INFINITY,
+                }
+            } else {
+                let [px, py] = self.points[point as usize];
+                let (lx, ly) = (x + cos * px - sin * py, y + sin * px + cos * py);
+                Beam {
+                    angle: ly.atan2(lx),
+                    range: lx.hypot(ly),
+                }
+            });
+        }
+    }
+
+    /// End points of the beams to weigh that have a return.
+    pub(crate) fn weighed_points(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
+        let points = self.chosen.iter().map(|&beam| self.point_of[beam as usize]);
+        points
+            .filter(|&point| point != NO_POINT)
+            .map(|point| self.points[point as usize])
+    }
+
+    /// Directions and the choice of beams, anew when the scanner's geometry has changed.
+    fn choose(&mut self, scan: &Scan, parameters: &BeamParameters) {
+        let geometry = (
+            scan.ranges.len(),
+            scan.angle_min,
+            scan.angle_increment,
+            parameters.clone(),
+        );
+        if self.geometry.as_ref() == Some(&geometry) {
+            return;
+        }
+        let angle = |i: usize| scan.angle_min + scan.angle_increment * i as f64;
+        self.directions.clear();
+        self.directions
+            .extend((0..scan.ranges.len()).map(|i| [angle(i).cos() as f32, angle(i).sin() as f32]));
+        self.chosen = match parameters.beam_layout {
+            BeamLayout::Uniform => uniform(scan.ranges.len(), parameters.beams),
+            BeamLayout::Boxed => boxed(
+                scan.ranges.len(),
+                scan.angle_min,
+                scan.angle_increment,
+                parameters,
+            ),
+        };
+        self.geometry = Some(geometry);
+    }
+}
+
+/// `wanted` beams at equal angles, the first and last included.
+fn uniform(count: usize, wanted: usize) -> Vec<u32> {
+    let wanted = wanted.min(count);
+    let last = (count - 1) as f64;
+    let mut chosen: Vec<u32> = (0..wanted)
+        .map(|k| (k as f64 * last / (wanted.max(2) - 1) as f64).round() as u32)
+        .collect();
+    chosen.dedup();
+    chosen
+}
+
+/// `wanted` beams whose ends on the outline of a corridor of the given aspect ratio, with the car in its middle
+/// looking along it, are equally spaced.
+fn boxed(count: usize, angle_min: f64, increment: f64, parameters: &BeamParameters) -> Vec<u32> {
+    let (half_length, half_width) = (parameters.lidar_aspect_ratio, 1.0);
+    let outline = |i: usize| {
+        let (sin, cos) = (angle_min + increment * i as f64).sin_cos();
+        let reach = (half_length / cos.abs().max(1e-9)).min(half_width / sin.abs().max(1e-9));
+        [reach * cos, reach * sin]
+    };
+    let mut path = Vec::with_capacity(count);
+    let (mut length, mut before) = (0.0, outline(0));
+    for i in 0..count {
+        let here = outline(i);
+        length += f64::hypot(here[0] - before[0], here[1] - before[1]);
+        path.push(length);
+        before = here;
+    }
+    let wanted = parameters.beams.min(count);
+    let mut chosen: Vec<u32> = (0..wanted)
+        .map(|k| {
+            let target = length * k as f64 / (wanted.max(2) - 1) as f64;
+            path.partition_point(|&at| at < target).min(count - 1) as u32
+        })
+        .collect();
+    chosen.dedup();
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Odometry, Stamp, Twist};
+    use std::f64::consts::PI;
+
+    const COUNT: usize = 1081;
+
+    fn scan(ranges: Vec<f32>) -> Scan {
+        Scan {
+            stamp: Stamp(1_000_000_000),
+            angle_min: -0.75 * PI,
+            angle_increment: 1.5 * PI / (COUNT - 1) as f64,
+            time_increment: 0.018_75 / (COUNT - 1) as f64,
+            range_min: 0.06,
+            range_max: 30.0,
+            ranges,
+        }
+    }
+
+    fn driving(twist: Twist) -> OdometryTrack {
+        let mut track = OdometryTrack::default();
+        for i in 0..100i64 {
+            let t = i as f64 * 0.02;
+            let pose = Pose::exp([twist.linear_x * t, 0.0, twist.angular * t]);
+            track
+                .push(
+                    &Odometry {
+                        stamp: Stamp(i * 20_000_000),
+                        pose,
+                        twist,
+                    },
+                    false,
+                )
+                .expect("sound");
+        }
+        track
+    }
+
+    fn load(scan: &Scan, track: &OdometryTrack, parameters: &BeamParameters) -> Result<ReadyScan, Dropped> {
+        let mut ready = ReadyScan::default();
+        ready
+            .load(scan, track, Pose::new(0.27, 0.0, 0.0), 25.0, parameters)
+            .map(|()| ready)
+    }
+
+    #[test]
+    fn a_wall_measured_on_the_move_is_straight_after_deskewing() {
+        // A wall at x = 10 m seen from a car that drives at 7 m/s and turns at 1 rad/s.
+        let twist = Twist {
+            linear_x: 7.0,
+            linear_y: 0.0,
+            angular: 1.0,
+        };
+        let track = driving(twist);
+        let mut moving = scan(vec![f32::INFINITY; COUNT]);
+        let (at_stamp, _) = track.at(moving.stamp, 0.0).expect("covered");
+        for i in 0..COUNT {
+            let (pose, _) = track
+                .at(moving.stamp.plus(moving.time_increment * i as f64), 0.0)
+                .expect("covered");
+            let laser = at_stamp.inverse() * pose * Pose::new(0.27, 0.0, 0.0);
+            let direction = laser.heading + moving.angle_min + moving.angle_increment * i as f64;
+            if direction.cos() > 0.5 {
+                moving.ranges[i] = ((10.0 - laser.x) / direction.cos()) as f32;
+            }
+        }
+        let ready = load(&moving, &track, &BeamParameters::default()).expect("sound");
+        assert!(ready.points.len() > 400);
+        assert!(ready.points.iter().all(|point| (point[0] - 10.0).abs() < 1e-3));
+        let skewed = load(
+            &moving,
+            &track,
+            &BeamParameters {
+                deskew: false,
+                ..BeamParameters::default()
+            },
+        );
+        let worst = |ready: &ReadyScan| {
+            ready
+                .points
+                .iter()
+                .map(|p| (p[0] - 10.0).abs())
+                .fold(0.0, f32::max)
+        };
+        assert!(worst(&skewed.expect("sound")) > 0.05);
+    }
+
+    #[test]
+    fn boxed_beams_look_ahead_and_back() {
+        let parameters = BeamParameters::default();
+        let chosen = boxed(COUNT, -0.75 * PI, 1.5 * PI / (COUNT - 1) as f64, &parameters);
+        assert!((19..=21).contains(&chosen.len()));
+        let ahead = |limit: f64| {
+            let angle = |i: u32| -0.75 * PI + 1.5 * PI / (COUNT - 1) as f64 * f64::from(i);
+            chosen.iter().filter(|&&i| angle(i).abs() < limit).count()
+        };
+        let evenly = 21.0 * 2.0 * 0.6 / (1.5 * PI);
+        assert!(
+            ahead(0.6) as f64 > 1.5 * evenly,
+            "{} beams within 0.6 rad",
+            ahead(0.6)
+        );
+    }
+
+    #[test]
+    fn what_is_no_reading_is_no_return() {
+        let mut ranges = vec![5.0; COUNT];
+        ranges[..5].copy_from_slice(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 65.533]);
+        ranges[5] = 0.01;
+        let ready = load(
+            &scan(ranges),
+            &OdometryTrack::default(),
+            &BeamParameters::default(),
+        )
+        .expect("sound");
+        assert_eq!(ready.points.len(), COUNT - 6);
+        assert!((ready.no_return - 6.0 / COUNT as f64).abs() < 1e-12);
+        assert!(ready.beams[0].range.is_infinite());
+    }
+
+    #[test]
+    fn scans_that_make_no_sense_are_refused() {
+        let track = OdometryTrack::default();
+        let parameters = BeamParameters::default();
+        let bad = |change: fn(&mut Scan)| {
+            let mut scan = scan(vec![5.0; COUNT]);
+            change(&mut scan);
+            load(&scan, &track, &parameters).err()
+        };
+        assert_eq!(bad(|_| ()), None);
+        assert_eq!(bad(|s| s.ranges.clear()), Some(Dropped::Malformed));
+        assert_eq!(bad(|s| s.angle_min = f64::NAN), Some(Dropped::Malformed));
+        assert_eq!(bad(|s| s.angle_increment = 0.0), Some(Dropped::Malformed));
+        assert_eq!(bad(|s| s.time_increment = -1.0), Some(Dropped::Malformed));
+        assert_eq!(bad(|s| s.ranges.fill(f32::NAN)), Some(Dropped::NoBeams));
+        assert_eq!(bad(|s| s.ranges.truncate(1)), None);
+    }
+}

@@ -1,0 +1,259 @@
+//! Odometry as a continuous motion: interpolated between messages, carried on a little beyond the last.
+
+use std::collections::VecDeque;
+
+use maps::Pose;
+
+use crate::{Dropped, Odometry, Stamp, Twist, YawRate};
+
+/// The recent odometry. Jumps are taken out and gyroscope turns put in as messages arrive, so that whoever reads
+/// it sees one smooth motion in a frame of its own.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct OdometryTrack {
+    /// Poses in the smooth frame.
+    points: VecDeque<Odometry>,
+    /// The last message as it came.
+    last: Option<Odometry>,
+    yaw_rates: VecDeque<YawRate>,
+    /// Jumps taken out so far.
+    pub(crate) jumps: u64,
+}
+
+/// As much as a late scan can need: 2 s at 200 Hz.
+const KEPT: usize = 400;
+
+/// A step is a jump if it differs by more than this from what the twist says [m], [rad]...
+const JUMP: [f64; 2] = [0.3, 0.3];
+/// ...plus this much per second, for a twist that is wrong [m/s], [rad/s].
+const JUMP_RATE: [f64; 2] = [3.0, 3.0];
+
+/// A gyroscope is silent when its last reading is older than this [s].
+const GYRO_SILENT: f64 = 0.1;
+
+impl OdometryTrack {
+    pub(crate) fn push(&mut self, odometry: &Odometry, use_imu: bool) -> Result<(), Dropped> {
+        let Twist {
+            linear_x,
+            linear_y,
+            angular,
+        } = odometry.twist;
+        let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
+        // Faster than any car of this kind: a broken driver, and no use to the filter.
+        let sound = odometry.pose.is_finite()
+            && sane(odometry.pose.x, 1e7)
+            && sane(odometry.pose.y, 1e7)
+            && sane(linear_x, 100.0)
+            && sane(linear_y, 100.0)
+            && sane(angular, 100.0);
+        if !sound {
+            return Err(Dropped::Malformed);
+        }
+        let Some(last) = self.last else {
+            self.last = Some(*odometry);
+            self.points.push_back(*odometry);
+            return Ok(());
+        };
+        if odometry.stamp <= last.stamp {
+            return Err(Dropped::TimeBackwards);
+        }
+        let dt = odometry.stamp.since(last.stamp);
+        let mut step = odometry.pose.since(last.pose);
+        let expected = Pose::exp(mean_twist(&last.twist, &odometry.twist).map(|v| v * dt.min(1.0)));
+        let off = [
+            step.distance(expected),
+            maps::wrap_angle(step.heading - expected.heading).abs(),
+        ];
+        if off[0] > JUMP[0] + JUMP_RATE[0] * dt || off[1] > JUMP[1] + JUMP_RATE[1] * dt {
+            self.jumps += 1;
+            step = expected;
+        }
+        if use_imu && let Some(turn) = self.turn_by_gyro(last.stamp, odometry.stamp) {
+            // The same arc, turned by the gyroscope.
+            let [x, y, _] = step.log();
+            step = Pose::exp([x, y, turn]);
+        }
+        let before = self.points.back().expect("a last message has a point").pose;
+        self.last = Some(*odometry);
+        self.points.push_back(Odometry {
+            pose: before * step,
+            ..*odometry
+        });
+        if self.points.len() > KEPT {
+            self.points.pop_front();
+        }
+        Ok(())
+    }
+
+    pub(crate) fn push_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
+        if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < 100.0) {
+            return Err(Dropped::Malformed);
+        }
+        if self
+            .yaw_rates
+            .back()
+            .is_some_and(|last| yaw_rate.stamp <= last.stamp)
+        {
+            return Err(Dropped::TimeBackwards);
+        }
+        self.yaw_rates.push_back(*yaw_rate);
+        if self.yaw_rates.len() > KEPT {
+            self.yaw_rates.pop_front();
+        }
+        Ok(())
+    }
+
+    /// The turn from one stamp to another by the gyroscope [rad], held between readings; None if it was silent.
+    fn turn_by_gyro(&self, from: Stamp, to: Stamp) -> Option<f64> {
+        let first = self
+            .yaw_rates
+            .partition_point(|reading| reading.stamp <= from)
+            .checked_sub(1)?;
+        let last = self.yaw_rates.back()?;
+        if to.since(last.stamp) > GYRO_SILENT {
+            return None;
+        }
+        let (mut turn, mut at) = (0.0, from);
+        let mut rate = self.yaw_rates[first].rate;
+        for reading in self
+            .yaw_rates
+            .range(first + 1..)
+            .take_while(|reading| reading.stamp < to)
+        {
+            turn += rate * reading.stamp.since(at);
+            (at, rate) = (reading.stamp, reading.rate);
+        }
+        Some(turn + rate * to.since(at))
+    }
+
+    /// The stamp of the latest message.
+    pub(crate) fn latest(&self) -> Option<Stamp> {
+        self.points.back().map(|point| point.stamp)
+    }
+
+    /// The pose in the smooth frame at a stamp: interpolated on SE(2), carried on by the last twist for at most
+    /// `carry` [s] beyond the last message. None before the first message.
+    pub(crate) fn at(&self, stamp: Stamp, carry: f64) -> Option<(Pose, Twist)> {
+        let after = self.points.partition_point(|point| point.stamp <= stamp);
+        let Some(before) = after.checked_sub(1) else {
+            // A scan may be a little older than the first odometry.
+            let first = self.points.front()?;
+            let dt = stamp.since(first.stamp);
+            return (dt >= -carry).then(|| (first.pose * moved(&first.twist, dt), first.twist));
+        };
+        let a = &self.points[before];
+        if let Some(b) = self.points.get(after) {
+            let fraction = stamp.since(a.stamp) / b.stamp.since(a.stamp);
+            let mix = |from: f64, to: f64| from + (to - from) * fraction;
+            let twist = Twist {
+                linear_x: mix(a.twist.linear_x, b.twist.linear_x),
+                linear_y: mix(a.twist.linear_y, b.twist.linear_y),
+                angular: mix(a.twist.angular, b.twist.angular),
+            };
+            Some((a.pose.interpolate(b.pose, fraction), twist))
+        } else {
+            let dt = stamp.since(a.stamp).min(carry);
+            Some((a.pose * moved(&a.twist, dt), a.twist))
+        }
+    }
+}
+
+/// The motion of a constant twist over `dt` [s].
+fn moved(twist: &Twist, dt: f64) -> Pose {
+    Pose::exp([twist.linear_x * dt, twist.linear_y * dt, twist.angular * dt])
+}
+
+fn mean_twist(a: &Twist, b: &Twist) -> [f64; 3] {
+    [
+        f64::midpoint(a.linear_x, b.linear_x),
+        f64::midpoint(a.linear_y, b.linear_y),
+        f64::midpoint(a.angular, b.angular),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A car on a circle of 2 m at 4 m/s, 50 Hz.
+    fn circle(i: i64) -> Odometry {
+        let t = i as f64 * 0.02;
+        let twist = Twist {
+            linear_x: 4.0,
+            linear_y: 0.0,
+            angular: 2.0,
+        };
+        Odometry {
+            stamp: Stamp(i * 20_000_000),
+            pose: moved(&twist, t),
+            twist,
+        }
+    }
+
+    fn track(messages: impl IntoIterator<Item = Odometry>) -> OdometryTrack {
+        let mut track = OdometryTrack::default();
+        for message in messages {
+            track.push(&message, true).expect("sound");
+        }
+        track
+    }
+
+    #[test]
+    fn a_circle_is_interpolated_and_carried_on_exactly() {
+        let track = track((0..10).map(circle));
+        for t in [0.0, 0.013, 0.1, 0.177, 0.19] {
+            let (pose, _) = track.at(Stamp(0).plus(t), 0.05).expect("covered");
+            let truth = moved(&circle(0).twist, t);
+            assert!(pose.distance(truth) < 1e-9, "at {t}: {pose:?} {truth:?}");
+        }
+    }
+
+    #[test]
+    fn a_jump_of_the_pose_is_no_motion() {
+        let mut messages: Vec<_> = (0..10).map(circle).collect();
+        for message in &mut messages[5..] {
+            message.pose.x += 7.0;
+        }
+        let track = track(messages);
+        assert_eq!(track.jumps, 1);
+        let (pose, _) = track.at(Stamp(9 * 20_000_000), 0.0).expect("covered");
+        assert!(pose.distance(circle(9).pose) < 1e-2);
+    }
+
+    #[test]
+    fn the_gyroscope_turns_the_car_where_odometry_does_not() {
+        let mut track = OdometryTrack::default();
+        for i in 0..=50 {
+            track
+                .push_yaw_rate(&YawRate {
+                    stamp: Stamp(i * 20_000_000),
+                    rate: 0.5,
+                })
+                .expect("sound");
+            let twist = Twist {
+                linear_x: 1.0,
+                ..Twist::default()
+            };
+            let odometry = Odometry {
+                stamp: Stamp(i * 20_000_000),
+                pose: moved(&twist, i as f64 * 0.02),
+                twist,
+            };
+            track.push(&odometry, true).expect("sound");
+        }
+        let (pose, _) = track.at(Stamp(1_000_000_000), 0.0).expect("covered");
+        assert!((pose.heading - 0.5).abs() < 0.02, "{pose:?}");
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused() {
+        let mut track = track((0..3).map(circle));
+        assert_eq!(track.push(&circle(2), true), Err(Dropped::TimeBackwards));
+        let mut nan = circle(3);
+        nan.pose.x = f64::NAN;
+        assert_eq!(track.push(&nan, true), Err(Dropped::Malformed));
+        let mut absurd = circle(3);
+        absurd.twist.linear_x = 1e9;
+        assert_eq!(track.push(&absurd, true), Err(Dropped::Malformed));
+        assert_eq!(track.push(&circle(3), true), Ok(()));
+    }
+}

@@ -1,0 +1,142 @@
+//! When the filter doubts itself: injection of particles, and the decision to search anew.
+
+use serde::{Deserialize, Serialize};
+
+use crate::parameters::Check;
+
+/// Parameters of recovery.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RecoveryParameters {
+    /// Share by which the long-term average of the likelihood follows each scan (Probabilistic Robotics, table 8.3).
+    pub alpha_slow: f64,
+    /// Share by which the short-term average follows.
+    pub alpha_fast: f64,
+    /// Inject particles along the track when the short-term average falls below the long-term one.
+    pub injection: bool,
+    /// Below this ratio of the averages particles are injected.
+    pub injection_ratio: f64,
+    /// Most particles that one resampling injects, as a share.
+    pub injection_share: f64,
+    /// Search the whole map when localization is lost.
+    pub recover: bool,
+    /// Alignment below which the pose may be wrong.
+    pub lost_alignment: f64,
+    /// Share of beams that are longer than the map says above which the pose may be wrong.
+    pub lost_long_beams: f64,
+    /// How long both must hold until the filter searches [s].
+    pub lost_after: f64,
+}
+
+impl Default for RecoveryParameters {
+    fn default() -> Self {
+        Self {
+            alpha_slow: 0.01,
+            alpha_fast: 0.3,
+            injection: true,
+            injection_ratio: 0.8,
+            injection_share: 0.2,
+            recover: true,
+            lost_alignment: 0.45,
+            lost_long_beams: 0.15,
+            lost_after: 0.25,
+        }
+    }
+}
+
+impl RecoveryParameters {
+    pub(crate) fn validate(&self, check: &mut Check) {
+        check.range("alpha_slow", self.alpha_slow, 1e-6, 1.0);
+        check.range("alpha_fast", self.alpha_fast, 1e-6, 1.0);
+        check.that("alpha_slow", self.alpha_slow < self.alpha_fast, || {
+            format!("{} is not below alpha_fast, {}", self.alpha_slow, self.alpha_fast)
+        });
+        check.range("injection_ratio", self.injection_ratio, 0.0, 1.0);
+        check.range("injection_share", self.injection_share, 0.0, 0.9);
+        check.range("lost_alignment", self.lost_alignment, 0.0, 1.0);
+        check.range("lost_long_beams", self.lost_long_beams, 0.0, 1.0);
+        check.range("lost_after", self.lost_after, 0.05, 10.0);
+    }
+}
+
+/// The averages of augmented MCL, over the fit of the scan at the estimate.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Doubt {
+    averages: Option<[f64; 2]>,
+    /// Since when the pose has looked wrong [s].
+    wrong_for: f64,
+}
+
+impl Doubt {
+    /// Takes in the likelihood of a scan, any positive measure whose ratio means something. Returns
+    /// `w_fast` / `w_slow`.
+    pub(crate) fn push(&mut self, likelihood: f64, parameters: &RecoveryParameters) -> f64 {
+        let [slow, fast] = self.averages.unwrap_or([likelihood; 2]);
+        let slow = slow + parameters.alpha_slow * (likelihood - slow);
+        let fast = fast + parameters.alpha_fast * (likelihood - fast);
+        self.averages = Some([slow, fast]);
+        if slow > 0.0 { fast / slow } else { 1.0 }
+    }
+
+    /// True when the pose has looked wrong for long enough: alignment and the beams that reach through walls agree.
+    /// What stands in view makes beams short, not long, so an opponent alone is never a reason.
+    pub(crate) fn lost(
+        &mut self,
+        alignment: f64,
+        long_beams: f64,
+        short_beams: f64,
+        seconds: f64,
+        parameters: &RecoveryParameters,
+    ) -> bool {
+        let misaligned = alignment < parameters.lost_alignment;
+        let through_walls = long_beams > parameters.lost_long_beams;
+        // Nearly everything short and nothing aligned is no opponent: it is another place.
+        let elsewhere = alignment < 0.5 * parameters.lost_alignment && short_beams < 0.8;
+        if misaligned && (through_walls || elsewhere) {
+            self.wrong_for += seconds;
+        } else {
+            self.wrong_for = 0.0;
+        }
+        // Steps of a scan's interval do not add up exactly.
+        self.wrong_for > parameters.lost_after - 1e-3
+    }
+
+    /// Starts anew, because the pose has been set or found.
+    pub(crate) fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sudden_fall_shows_and_fades() {
+        let parameters = RecoveryParameters::default();
+        let mut doubt = Doubt::default();
+        for _ in 0..200 {
+            assert!((doubt.push(0.9, &parameters) - 1.0).abs() < 1e-9);
+        }
+        let mut ratio = 1.0;
+        for _ in 0..10 {
+            ratio = doubt.push(0.2, &parameters);
+        }
+        assert!(ratio < 0.4, "{ratio}");
+        for _ in 0..2000 {
+            ratio = doubt.push(0.2, &parameters);
+        }
+        assert!(ratio > 0.95, "{ratio}");
+    }
+
+    #[test]
+    fn an_opponent_is_no_loss_but_a_wrong_place_is() {
+        let parameters = RecoveryParameters::default();
+        let mut doubt = Doubt::default();
+        for _ in 0..100 {
+            assert!(!doubt.lost(0.4, 0.0, 0.6, 0.025, &parameters));
+        }
+        let scans = (1..100).find(|_| doubt.lost(0.3, 0.3, 0.3, 0.025, &parameters));
+        assert_eq!(scans, Some(10));
+    }
+}

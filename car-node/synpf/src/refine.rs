@@ -1,0 +1,318 @@
+//! Refinement: the whole scan fitted to the distance field, around what was predicted.
+//!
+//! Gauss-Newton on the signed distances of the end points, with a robust weight per beam and the prediction as a
+//! prior (the fit of a mean to the map after Peng et al., Complexity 2018/2327637; the prior makes it an iterated
+//! Kalman filter). Where the scan says nothing, along a featureless straight, the prior stays, and so does its
+//! covariance: it says in which direction nothing was learned.
+
+use maps::{DistanceField, Pose};
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::parameters::Check;
+
+/// Parameters of the refinement.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RefinementParameters {
+    /// Whether the estimate is refined; else it is the particles' weighted mean.
+    pub refine: bool,
+    /// Most end points that are fitted; more are thinned out evenly.
+    pub refine_beams: usize,
+    /// Most Gauss-Newton steps.
+    pub refine_iterations: usize,
+    /// Standard deviation of an end point's distance to its wall [m]: laser and map together.
+    pub refine_sigma: f64,
+    /// Distance from a wall at which an end point counts a quarter [m]; farther ones are opponents.
+    pub refine_reach: f64,
+    /// How many neighbouring end points err together, and so count as one.
+    pub refine_correlation: f64,
+    /// Share of the particles that are drawn around the refined estimate when resampling.
+    pub refine_feedback: f64,
+}
+
+impl Default for RefinementParameters {
+    fn default() -> Self {
+        Self {
+            refine: true,
+            refine_beams: 360,
+            refine_iterations: 8,
+            refine_sigma: 0.03,
+            refine_reach: 0.08,
+            refine_correlation: 6.0,
+            refine_feedback: 0.1,
+        }
+    }
+}
+
+impl RefinementParameters {
+    pub(crate) fn validate(&self, check: &mut Check) {
+        check.range("refine_beams", self.refine_beams as f64, 10.0, 10_000.0);
+        check.range("refine_iterations", self.refine_iterations as f64, 1.0, 100.0);
+        check.range("refine_sigma", self.refine_sigma, 1e-3, 1.0);
+        check.range("refine_reach", self.refine_reach, 1e-3, 2.0);
+        check.range("refine_correlation", self.refine_correlation, 1.0, 1000.0);
+        check.range("refine_feedback", self.refine_feedback, 0.0, 0.5);
+    }
+}
+
+/// A pose with its uncertainty, in the grid's frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Estimate {
+    /// The pose of `base_link`.
+    pub(crate) pose: Pose,
+    /// Covariance of x, y [m^2] and heading [rad^2].
+    pub(crate) covariance: Matrix3<f64>,
+}
+
+/// The sums of one Gauss-Newton step.
+struct Normal {
+    information: Matrix3<f64>,
+    gradient: Vector3<f64>,
+}
+
+/// Fits the end points to the field around `prior`, starting from `start`.
+pub(crate) fn refine(
+    field: &DistanceField,
+    points: &[[f32; 2]],
+    start: Pose,
+    prior: &Estimate,
+    parameters: &RefinementParameters,
+) -> Estimate {
+    let stride = points.len().div_ceil(parameters.refine_beams).max(1);
+    let weight =
+        1.0 / (parameters.refine_sigma.powi(2) * (parameters.refine_correlation / stride as f64).max(1.0));
+    let prior_information = regular_inverse(&prior.covariance);
+    // A start that may be far off looks farther at first.
+    let uncertain = (prior.covariance[(0, 0)] + prior.covariance[(1, 1)])
+        .sqrt()
+        .min(0.5);
+    let mut reach = parameters.refine_reach.max(uncertain);
+    let mut pose = start;
+    let mut information = prior_information;
+    for _ in 0..parameters.refine_iterations {
+        let normal = accumulate(field, points, stride, pose, reach as f32);
+        information = normal.information * weight + prior_information;
+        let off = Vector3::new(
+            pose.x - prior.pose.x,
+            pose.y - prior.pose.y,
+            maps::wrap_angle(pose.heading - prior.pose.heading),
+        );
+        let gradient = normal.gradient * weight + prior_information * off;
+        let Some(step) = information.cholesky().map(|root| root.solve(&gradient)) else {
+            break;
+        };
+        // No further than the field is anything like linear.
+        let length = step[0].hypot(step[1]);
+        let step = step * (0.3 / length.max(0.3)).min(0.1 / step[2].abs().max(0.1));
+        pose = Pose::new(pose.x - step[0], pose.y - step[1], pose.heading - step[2]);
+        let settled = length < 2e-4 && step[2].abs() < 1e-4;
+        if settled && reach <= parameters.refine_reach {
+            break;
+        }
+        reach = (reach * 0.5).max(parameters.refine_reach);
+    }
+    Estimate {
+        pose,
+        covariance: regular_inverse(&information),
+    }
+}
+
+/// The inverse of a symmetric matrix that may be singular to rounding.
+fn regular_inverse(matrix: &Matrix3<f64>) -> Matrix3<f64> {
+    let floor = Matrix3::from_diagonal(&Vector3::new(1e-12, 1e-12, 1e-12));
+    (matrix + floor)
+        .cholesky()
+        .map_or_else(|| Matrix3::identity() * 1e6, |root| root.inverse())
+}
+
+/// One pass over the end points.
+fn accumulate(field: &DistanceField, points: &[[f32; 2]], stride: usize, pose: Pose, reach: f32) -> Normal {
+    let cells = 1.0 / field.resolution() as f32;
+    let (sin, cos) = pose.heading.sin_cos();
+    let (sin, cos) = (sin as f32, cos as f32);
+    // Relative to the pose's cell, so that f32 resolves a micrometre anywhere on a map.
+    let (x, y) = (pose.x as f32, pose.y as f32);
+    let inverse_reach = 1.0 / reach;
+    let mut sums = [0.0f32; 9];
+    for point in points.iter().step_by(stride) {
+        let (dx, dy) = (cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]);
+        let Some(sample) = field.sample((x + dx) * cells, (y + dy) * cells) else {
+            continue;
+        };
+        let ratio = sample.distance * inverse_reach;
+        // Geman-McClure: a quarter at `reach`, next to nothing beyond three times it.
+        let w = 1.0 / (1.0 + ratio * ratio);
+        let w = w * w;
+        let [gx, gy] = sample.gradient;
+        let gh = dx * gy - dy * gx;
+        let (wx, wy, wh, d) = (w * gx, w * gy, w * gh, sample.distance);
+        for (sum, term) in sums.iter_mut().zip([
+            wx * gx,
+            wx * gy,
+            wx * gh,
+            wy * gy,
+            wy * gh,
+            wh * gh,
+            wx * d,
+            wy * d,
+            wh * d,
+        ]) {
+            *sum += term;
+        }
+    }
+    let [xx, xy, xh, yy, yh, hh, bx, by, bh] = sums.map(f64::from);
+    Normal {
+        information: Matrix3::new(xx, xy, xh, xy, yy, yh, xh, yh, hh),
+        gradient: Vector3::new(bx, by, bh),
+    }
+}
+
+/// How well the end points fit at a pose: the mean robust weight, in [0, 1].
+pub(crate) fn fit(field: &DistanceField, points: &[[f32; 2]], most: usize, pose: Pose, reach: f32) -> f64 {
+    let stride = points.len().div_ceil(most).max(1);
+    let cells = 1.0 / field.resolution() as f32;
+    let (sin, cos) = pose.heading.sin_cos();
+    let (sin, cos) = (sin as f32, cos as f32);
+    let (x, y) = (pose.x as f32, pose.y as f32);
+    let (mut sum, mut count) = (0.0f32, 0);
+    for point in points.iter().step_by(stride) {
+        let (dx, dy) = (cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]);
+        count += 1;
+        if let Some(distance) = field.nearest((x + dx) * cells, (y + dy) * cells) {
+            let ratio = distance / reach;
+            sum += 1.0 / (1.0 + ratio * ratio);
+        }
+    }
+    f64::from(sum) / f64::from(count.max(1))
+}
+
+impl Estimate {
+    /// The estimate carried on by a motion of `base_link`, whose uncertainty in its own frame is `noise`.
+    pub(crate) fn moved(&self, motion: Pose, noise: &Matrix3<f64>) -> Self {
+        let pose = self.pose * motion;
+        let (dx, dy) = (pose.x - self.pose.x, pose.y - self.pose.y);
+        let jacobian = Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0);
+        let (sin, cos) = self.pose.heading.sin_cos();
+        let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
+        let covariance = jacobian * self.covariance * jacobian.transpose() + turn * noise * turn.transpose();
+        Self { pose, covariance }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maps::{Cell, OccupancyGrid};
+
+    /// A room of 10 x 6 m in cells of 5 cm; `open` leaves the short walls 20 m away, out of the laser's sight.
+    fn room(open: bool) -> DistanceField {
+        let (width, height) = (if open { 1000 } else { 200 }, 120);
+        let cells = (0..width * height)
+            .map(|i| match (i % width, i / width) {
+                (_, 0 | 119) => Cell::Occupied,
+                (column, _) if column == 0 || column == width - 1 => Cell::Occupied,
+                _ => Cell::Free,
+            })
+            .collect();
+        DistanceField::new(&OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells))
+    }
+
+    /// What a laser of 20 m sees all around, in its own frame.
+    fn scan(field: &DistanceField, pose: Pose) -> Vec<[f32; 2]> {
+        let start = [(pose.x / 0.05) as f32, (pose.y / 0.05) as f32];
+        (0..720)
+            .filter_map(|i| {
+                let angle = f64::from(i) * 0.5f64.to_radians();
+                let direction = pose.heading + angle;
+                let range = field.trace(start, [direction.cos() as f32, direction.sin() as f32], 400.0);
+                (range < 400.0).then(|| {
+                    [
+                        range * 0.05 * angle.cos() as f32,
+                        range * 0.05 * angle.sin() as f32,
+                    ]
+                })
+            })
+            .collect()
+    }
+
+    fn wide(pose: Pose) -> Estimate {
+        Estimate {
+            pose,
+            covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
+        }
+    }
+
+    #[test]
+    fn a_start_a_hand_off_ends_on_the_truth() {
+        let field = room(false);
+        let truth = Pose::new(4.0, 2.0, 0.4);
+        let start = Pose::new(4.1, 1.92, 0.45);
+        let found = refine(
+            &field,
+            &scan(&field, truth),
+            start,
+            &wide(start),
+            &RefinementParameters::default(),
+        );
+        assert!(found.pose.distance(truth) < 0.002, "{found:?}");
+        assert!((found.pose.heading - truth.heading).abs() < 5e-4);
+        assert!(found.covariance[(0, 0)].sqrt() < 0.02);
+    }
+
+    #[test]
+    fn opponents_do_not_pull() {
+        let field = room(false);
+        let truth = Pose::new(4.0, 2.0, 0.4);
+        let mut points = scan(&field, truth);
+        for point in &mut points[100..220] {
+            *point = point.map(|v| v * 0.5);
+        }
+        let start = Pose::new(4.03, 1.98, 0.41);
+        let found = refine(
+            &field,
+            &points,
+            start,
+            &wide(start),
+            &RefinementParameters::default(),
+        );
+        assert!(found.pose.distance(truth) < 0.01, "{found:?}");
+    }
+
+    #[test]
+    fn along_a_featureless_straight_nothing_is_learned_and_the_covariance_says_so() {
+        let field = room(true);
+        let truth = Pose::new(25.0, 2.0, 0.0);
+        let start = Pose::new(25.1, 2.05, 0.02);
+        let found = refine(
+            &field,
+            &scan(&field, truth),
+            start,
+            &wide(start),
+            &RefinementParameters::default(),
+        );
+        assert!(
+            (found.pose.y - 2.0).abs() < 0.002 && found.pose.heading.abs() < 1e-3,
+            "{found:?}"
+        );
+        assert!(
+            (found.pose.x - 25.1).abs() < 0.01,
+            "the prior stays along the straight"
+        );
+        assert!((found.covariance[(0, 0)].sqrt() - 0.2).abs() < 0.02);
+        assert!(found.covariance[(1, 1)].sqrt() < 0.02);
+    }
+
+    #[test]
+    fn no_points_leave_the_prior() {
+        let start = Pose::new(4.0, 2.0, 0.4);
+        let found = refine(
+            &room(false),
+            &[],
+            start,
+            &wide(start),
+            &RefinementParameters::default(),
+        );
+        assert!(found.pose.distance(start) < 1e-9);
+    }
+}

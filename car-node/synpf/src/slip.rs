@@ -1,0 +1,111 @@
+//! Slip: what odometry says the car did against what the posterior says.
+
+use std::collections::VecDeque;
+
+use maps::Pose;
+
+use crate::Stamp;
+
+/// Compares odometry with the posterior over a sliding window.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SlipWindow {
+    steps: VecDeque<Step>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    stamp: Stamp,
+    seconds: f64,
+    odometry: [f64; 2],
+    posterior: [f64; 2],
+}
+
+/// Slip over the window.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(crate) struct Slip {
+    /// (odometry's distance - the posterior's) / odometry's; positive when wheels spin, negative when they lock.
+    pub(crate) ratio: f64,
+    /// Odometry's yaw rate less the posterior's [rad/s].
+    pub(crate) yaw_rate: f64,
+}
+
+/// Length of the window [s].
+const WINDOW: f64 = 0.3;
+
+/// Below this a share of the distance says nothing [m/s].
+const WALKING: f64 = 1.0;
+
+impl SlipWindow {
+    /// Adds one scan's motion, by odometry and by the posterior, each in the frame of its own start.
+    pub(crate) fn push(&mut self, stamp: Stamp, seconds: f64, odometry: Pose, posterior: Pose) {
+        self.steps.push_back(Step {
+            stamp,
+            seconds,
+            odometry: [odometry.x, odometry.heading],
+            posterior: [posterior.x, posterior.heading],
+        });
+        while self
+            .steps
+            .front()
+            .is_some_and(|step| stamp.since(step.stamp) > WINDOW)
+        {
+            self.steps.pop_front();
+        }
+    }
+
+    /// The slip over the window; zero below walking speed and before the window is half full.
+    pub(crate) fn slip(&self) -> Slip {
+        let sum = |of: fn(&Step) -> f64| self.steps.iter().map(of).sum::<f64>();
+        let seconds = sum(|step| step.seconds);
+        if seconds < WINDOW / 2.0 {
+            return Slip::default();
+        }
+        let driven = sum(|step| step.odometry[0]);
+        let ratio = if driven.abs() < WALKING * seconds {
+            0.0
+        } else {
+            (driven - sum(|step| step.posterior[0])) / driven
+        };
+        let yaw_rate = (sum(|step| step.odometry[1]) - sum(|step| step.posterior[1])) / seconds;
+        Slip {
+            ratio: ratio.clamp(-2.0, 2.0),
+            yaw_rate,
+        }
+    }
+
+    /// Forgets, because the pose has jumped.
+    pub(crate) fn clear(&mut self) {
+        self.steps.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn slip(odometry: Pose, posterior: Pose) -> Slip {
+        let mut window = SlipWindow::default();
+        for i in 0..20 {
+            window.push(Stamp(i * 25_000_000), 0.025, odometry, posterior);
+        }
+        window.slip()
+    }
+
+    #[test]
+    fn spinning_wheels_are_positive_slip() {
+        let slip = slip(Pose::new(0.11, 0.0, 0.02), Pose::new(0.1, 0.0, 0.01));
+        assert!((slip.ratio - 0.01 / 0.11).abs() < 1e-9);
+        assert!((slip.yaw_rate - 0.4).abs() < 1e-9);
+    }
+
+    #[test]
+    fn at_a_standstill_there_is_none() {
+        assert!(
+            slip(Pose::new(0.001, 0.0, 0.0), Pose::new(-0.002, 0.0, 0.0))
+                .ratio
+                .abs()
+                < 1e-12
+        );
+        assert_eq!(SlipWindow::default().slip(), Slip::default());
+    }
+}

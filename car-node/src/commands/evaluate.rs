@@ -45,6 +45,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     let grid = OccupancyGrid::load(&arguments.map)?;
     let before = Instant::now();
     let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
+    map.prepare(None, &set.parameters);
     let range_table = RangeTable {
         build_ms: before.elapsed().as_secs_f64() * 1e3,
         bytes: map.table_bytes(),

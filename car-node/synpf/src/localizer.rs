@@ -233,7 +233,7 @@ impl Localizer {
         if !pose.is_finite() {
             return Err(SetUpError::Pose(pose));
         }
-        self.map.prepare(pose, &self.parameters);
+        self.map.prepare(Some(pose), &self.parameters);
         let particles = &self.parameters.particles;
         let sigma = [
             particles.initial_std_x,

@@ -5,9 +5,10 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
-use crate::SetUpError;
 use crate::cddt::Cddt;
 use crate::range_table::{RangeTable, TableParameters};
+use crate::sensor::RangeMethod;
+use crate::{Parameters, SetUpError};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,
 /// which are built for the regions that a car is in and shared between threads and localizers.
@@ -96,13 +97,22 @@ impl TrackMap {
         (f64::from(cells) * resolution).min(max_range)
     }
 
-    /// Builds the range table for the region around a pose in `map`, if it is not there yet, so that the first
-    /// update does not have to. Does nothing for a pose off the map.
-    pub fn prepare(&self, map_from_base_link: Pose, parameters: &crate::Parameters) {
-        if parameters.sensor.range_method == crate::sensor::RangeMethod::Lut
-            && let Some(region) = self.region_at(self.grid_from_map * map_from_base_link)
-        {
-            self.table(region, parameters.sensor.table_parameters(parameters.defects));
+    /// Builds the range tables that a set needs, if they are not there yet, so that the first update does not have
+    /// to: for the region around a pose in `map`, or, without one, for all that look like tracks.
+    pub fn prepare(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) {
+        match parameters.sensor.range_method {
+            RangeMethod::Lut => {
+                let at = map_from_base_link.map(|pose| self.region_at(self.grid_from_map * pose));
+                let regions =
+                    at.map_or_else(|| self.plausible_regions(), |region| region.into_iter().collect());
+                for region in regions {
+                    self.table(region, parameters.sensor.table_parameters(parameters.defects));
+                }
+            }
+            RangeMethod::Cddt => {
+                self.cddt();
+            }
+            RangeMethod::RayMarching => {}
         }
     }
 

@@ -243,7 +243,7 @@ impl Link {
             .congestion_control(ASK_CONGESTION)
             .priority(ASK_PRIORITY)
             .await
-            .inspect_err(|error| tracing::warn!(%key, %error, "the question could not be sent"))
+            .inspect_err(|error| tracing::debug!(%key, %error, "the question could not be sent"))
             .ok()?;
         while let Ok(reply) = replies.recv_async().await {
             match reply.into_result() {

@@ -1,12 +1,13 @@
 //! The command line.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
 use protocol::{CarName, Pose2};
 
-/// The pit wall: how well every car is localized and why.
+/// The pit wall: how well every car is localized and why. Without a command it serves the page.
 #[derive(Debug, Parser)]
 #[command(version, after_help = EXIT_CODES)]
 pub(crate) struct Cli {
@@ -15,8 +16,20 @@ pub(crate) struct Cli {
     /// Write JSON on stdout instead of text.
     #[arg(long, global = true)]
     pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) page: Page,
     #[command(subcommand)]
-    pub(crate) verb: Verb,
+    pub(crate) verb: Option<Verb>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Page {
+    /// Where the page is served. On any but a loopback address it asks for the token that is printed.
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:7448")]
+    pub(crate) page: SocketAddr,
+    /// The folder that recordings started from the page go to.
+    #[arg(long, value_name = "FOLDER", default_value = ".")]
+    pub(crate) recordings: PathBuf,
 }
 
 const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \

@@ -1,6 +1,6 @@
 //! The running pit wall: a link whose events keep a fleet up to date and, when asked, fill a recording.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -129,6 +129,12 @@ impl Hub {
     /// How the recording is getting on; None when there is none.
     pub fn recording(&self) -> Option<Status> {
         self.shared.recorder().as_ref().map(Recorder::status)
+    }
+
+    /// The file that is being recorded into.
+    pub fn recording_path(&self) -> Option<PathBuf> {
+        let recorder = self.shared.recorder();
+        recorder.as_ref().map(|recorder| recorder.path().to_owned())
     }
 
     /// Marks this moment, for the log and the recording.

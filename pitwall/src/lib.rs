@@ -17,6 +17,8 @@ mod link;
 mod log;
 mod recording;
 mod stream;
+mod wall;
+mod web;
 
 pub use ask::{PATIENCE, Verdict, new_command_id};
 pub use car::{Car, CarView, Lap, PoseView, SetView};
@@ -30,3 +32,5 @@ pub use recording::{
     Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events, recover,
 };
 pub use stream::{Stream, StreamView};
+pub use wall::{PitWall, WallError, WallOptions};
+pub use web::{Page, PageOptions};

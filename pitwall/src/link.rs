@@ -29,6 +29,8 @@ pub enum Role {
     Router {
         /// Endpoints to listen on, such as `tcp/0.0.0.0:7447`.
         listen: Vec<String>,
+        /// Answer cars on the local network that look for a pit wall by multicast.
+        discoverable: bool,
     },
     /// Join a router that is there already.
     Client {
@@ -48,6 +50,7 @@ impl Role {
         } else if !listen.is_empty() {
             Self::Router {
                 listen: listen.to_vec(),
+                discoverable: false,
             }
         } else if answers(LOCAL_WALL) {
             Self::Client {
@@ -56,19 +59,30 @@ impl Role {
         } else {
             Self::Router {
                 listen: vec![DEFAULT_LISTEN.to_owned()],
+                discoverable: true,
             }
         }
+    }
+
+    fn discoverable(&self) -> bool {
+        matches!(
+            self,
+            Self::Router {
+                discoverable: true,
+                ..
+            }
+        )
     }
 
     fn config(&self) -> Result<Config, LinkError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
         let mut entries = vec![
-            ("scouting/multicast/enabled", "false".to_owned()),
+            ("scouting/multicast/enabled", self.discoverable().to_string()),
             ("scouting/gossip/enabled", "false".to_owned()),
             ("transport/link/tx/lease", "2000".to_owned()),
         ];
         match self {
-            Self::Router { listen } => {
+            Self::Router { listen, .. } => {
                 entries.push(("mode", r#""router""#.to_owned()));
                 entries.push(("listen/endpoints", list(listen)));
             }
@@ -95,7 +109,7 @@ impl Role {
 impl std::fmt::Display for Role {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::Router { listen } => write!(f, "listening for cars on {}", listen.join(", ")),
+            Self::Router { listen, .. } => write!(f, "listening for cars on {}", listen.join(", ")),
             Self::Client { connect } => write!(f, "joined the pit wall at {}", connect.join(", ")),
         }
     }
@@ -318,7 +332,7 @@ pub enum LinkError {
 
 fn cannot(role: &Role) -> String {
     match role {
-        Role::Router { listen } => format!("cannot listen on {} (is the port taken?)", listen.join(", ")),
+        Role::Router { listen, .. } => format!("cannot listen on {} (is the port taken?)", listen.join(", ")),
         Role::Client { connect } => format!("no pit wall answers at {}", connect.join(", ")),
     }
 }

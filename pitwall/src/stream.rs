@@ -11,14 +11,16 @@ use crate::gaps::{Arrival, Gaps};
 #[derive(Debug, Clone, Default)]
 pub struct Stream {
     gaps: Gaps,
-    arrivals: VecDeque<i64>,
+    /// When the last messages were published, and when the newest arrived [unix ns].
+    published: VecDeque<i64>,
+    arrived: i64,
     newest: Option<Header>,
     unreadable: u64,
     late_by: f64,
 }
 
 impl Stream {
-    /// Arrivals that a rate is taken over.
+    /// Messages that a rate is taken over.
     const WINDOW: usize = 64;
 
     /// Takes note of a message that arrived at `at` [unix ns]. True when it is newer than all before it.
@@ -27,13 +29,17 @@ impl Stream {
         if arrival == Arrival::Repeated {
             return false;
         }
-        if self.arrivals.len() == Self::WINDOW {
-            self.arrivals.pop_front();
-        }
-        self.arrivals.push_back(at);
         let order = |h: &Header| (h.session, h.sequence);
         let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
         if newer {
+            if self.newest.is_some_and(|newest| newest.session != header.session) {
+                self.published.clear();
+            }
+            if self.published.len() == Self::WINDOW {
+                self.published.pop_front();
+            }
+            self.published.push_back(header.published);
+            self.arrived = at;
             self.newest = Some(*header);
             self.late_by = (at - header.published) as f64 * 1e-9;
         }
@@ -53,18 +59,19 @@ impl Stream {
 
     /// When the last message arrived [unix ns].
     pub fn last_arrival(&self) -> Option<i64> {
-        self.arrivals.back().copied()
+        self.newest.map(|_| self.arrived)
     }
 
-    /// Messages per second, up to `now` [unix ns]; falls when nothing comes.
+    /// Messages per second, up to `now` [unix ns]; falls when nothing comes. Taken from when they were published,
+    /// because what a car has kept for us arrives all at once.
     pub fn rate(&self, now: i64) -> f64 {
-        let (Some(first), Some(last)) = (self.arrivals.front(), self.arrivals.back()) else {
+        let (Some(first), Some(last)) = (self.published.front(), self.published.back()) else {
             return 0.0;
         };
         // A pause of one interval is what a steady stream has anyway.
-        let intervals = (self.arrivals.len() - 1) as f64;
+        let intervals = (self.published.len() - 1) as f64;
         let span = (last - first) as f64 * 1e-9;
-        let pause = (now - last) as f64 * 1e-9;
+        let pause = (now - self.arrived) as f64 * 1e-9;
         if intervals == 0.0 {
             return if pause < 1.5 { 1.0 } else { 0.0 };
         }
@@ -117,11 +124,15 @@ mod tests {
     const SECOND: i64 = 1_000_000_000;
 
     fn header(sequence: u64) -> Header {
+        published(sequence, 0)
+    }
+
+    fn published(sequence: u64, published: i64) -> Header {
         let stamps = Stamps {
             session: 1,
             sequence,
             sensor: 0,
-            published: 0,
+            published,
         };
         Header::new(Schema::Pose, 1, stamps)
     }
@@ -130,13 +141,23 @@ mod tests {
     fn the_rate_is_steady_and_falls_in_silence() {
         let mut stream = Stream::default();
         for i in 0..100 {
-            stream.arrive(&header(i + 1), i as i64 * SECOND / 40);
+            let at = i as i64 * SECOND / 40;
+            stream.arrive(&published(i + 1, at), at);
         }
         let last = 99 * SECOND / 40;
         assert!((stream.rate(last) - 40.0).abs() < 0.01);
         assert!((stream.rate(last + SECOND / 41) - 40.0).abs() < 0.01);
         assert!(stream.rate(last + 2 * SECOND) < 20.0);
         assert!(stream.rate(last + 100 * SECOND) < 1.0);
+    }
+
+    #[test]
+    fn a_burst_of_what_was_kept_is_no_high_rate() {
+        let mut stream = Stream::default();
+        for i in 0..20 {
+            stream.arrive(&published(i + 1, i as i64 * SECOND), 20 * SECOND);
+        }
+        assert!((stream.rate(20 * SECOND) - 1.0).abs() < 0.01);
     }
 
     #[test]

@@ -25,6 +25,7 @@ pub fn free_endpoint() -> String {
 pub fn router(endpoint: &str) -> Role {
     Role::Router {
         listen: vec![endpoint.to_owned()],
+        discoverable: false,
     }
 }
 

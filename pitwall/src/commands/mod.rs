@@ -4,6 +4,7 @@ mod cars;
 mod events;
 mod params;
 mod record;
+mod serve;
 mod steer;
 mod watch;
 
@@ -25,7 +26,15 @@ const NO_SUCH_CAR: u8 = 4;
 
 /// Does what the command line says.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
-    let Cli { link, json, verb } = cli;
+    let Cli {
+        link,
+        json,
+        page,
+        verb,
+    } = cli;
+    let Some(verb) = verb else {
+        return serve::run(&link, page, json).await;
+    };
     match verb {
         Verb::Cars { wait } => cars::run(&link, wait, json).await,
         Verb::Watch { car, time, rate } => watch::run(&link, &car, time, rate, json).await,

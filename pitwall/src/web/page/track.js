@@ -1,0 +1,333 @@
+// The track: map, raceline, cars with trail and spread, particles and end points of the selected car.
+
+import { STATES, colourOf } from "/cards.js";
+
+const TRAIL_S = 12;
+const END_POINTS = ["--good", "--quiet", "--warn", "--bad"];
+
+export class Track {
+  /// `placed(x, y, heading)` is called when a pose was dragged, `picked(number)` when a candidate was clicked.
+  constructor(canvas, placed, picked) {
+    this.canvas = canvas;
+    this.placed = placed;
+    this.picked = picked;
+    this.maps = new Map();
+    this.fetching = new Set();
+    this.trails = new Map();
+    this.view = null;
+    this.fitted = false;
+    this.follow = false;
+    this.placing = false;
+    this.drag = null;
+    this.candidates = [];
+    this.snapshot = null;
+    this.selected = null;
+    canvas.addEventListener("pointerdown", (e) => this.pressed(e));
+    canvas.addEventListener("pointermove", (e) => this.moved(e));
+    canvas.addEventListener("pointerup", (e) => this.released(e));
+    canvas.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      this.zoom(Math.exp(-e.deltaY * 0.0015), e.offsetX, e.offsetY);
+    }, { passive: false });
+  }
+
+  /// Takes in a snapshot; draws at the browser's next frame.
+  update(snapshot, selected) {
+    this.snapshot = snapshot;
+    this.selected = selected;
+    for (const car of snapshot.cars) {
+      if (!car.pose || car.blind) continue;
+      const trail = this.trails.get(car.car) ?? [];
+      const last = trail.at(-1);
+      const now = snapshot.now / 1e9;
+      if (!last || Math.hypot(last[0] - car.pose.x_m, last[1] - car.pose.y_m) > 0.05) {
+        trail.push([car.pose.x_m, car.pose.y_m, car.state, now]);
+        while (trail[0][3] < now - TRAIL_S) trail.shift();
+        this.trails.set(car.car, trail);
+      }
+    }
+    for (const car of snapshot.maps) {
+      if (!this.maps.has(car) && !this.fetching.has(car)) this.fetchMap(car);
+    }
+    if (!this.asked) {
+      this.asked = true;
+      requestAnimationFrame(() => { this.asked = false; this.draw(); });
+    }
+  }
+
+  async fetchMap(car) {
+    this.fetching.add(car);
+    const response = await fetch(`/map/${car}`);
+    this.fetching.delete(car);
+    if (response.ok) this.maps.set(car, await response.json());
+  }
+
+  /// The map shown: the selected car's, else the first there is.
+  map() { return this.maps.get(this.selected) ?? this.maps.values().next().value; }
+
+  /// Draws the grid once for each theme.
+  image(map) {
+    const theme = document.documentElement.dataset.theme;
+    map.images ??= {};
+    if (map.images[theme]) return map.images[theme];
+    const style = getComputedStyle(document.documentElement);
+    const colour = (name) => style.getPropertyValue(name).trim().match(/[0-9a-f]{2}/gi).map((h) => parseInt(h, 16));
+    const colours = [colour("--free"), colour("--wall"), colour("--unknown")];
+    const image = new OffscreenCanvas(map.width, map.height);
+    const context = image.getContext("2d");
+    const pixels = context.createImageData(map.width, map.height);
+    let at = 0;
+    for (const [cell, length] of map.runs) {
+      const [r, g, b] = colours[cell];
+      for (let i = 0; i < length; i++, at++) {
+        // The grid's first row is its lowest, the image's its highest.
+        const row = map.height - 1 - Math.floor(at / map.width);
+        pixels.data.set([r, g, b, 255], 4 * (row * map.width + at % map.width));
+      }
+    }
+    context.putImageData(pixels, 0, 0);
+    map.images[theme] = image;
+    return image;
+  }
+
+  /// Shows the whole track.
+  fit() {
+    const map = this.map();
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (!map || !width) return;
+    let points = map.raceline?.points ?? [];
+    if (points.length < 3) {
+      const [w, h] = [map.width * map.resolution, map.height * map.resolution];
+      const { x, y, heading } = map.origin;
+      const [c, s] = [Math.cos(heading), Math.sin(heading)];
+      points = [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => [x + c * u - s * v, y + s * u + c * v]);
+    }
+    const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
+    const [left, right, low, high] = [Math.min(...xs) - 2, Math.max(...xs) + 2, Math.min(...ys) - 2, Math.max(...ys) + 2];
+    const scale = Math.min(width / (right - left), height / (high - low));
+    this.view = { x: (left + right) / 2, y: (low + high) / 2, scale };
+    this.fitted = true;
+  }
+
+  /// Zooms about a point of the canvas [px].
+  zoom(factor, px = this.canvas.clientWidth / 2, py = this.canvas.clientHeight / 2) {
+    if (!this.view) return;
+    const [x, y] = this.toMap(px, py);
+    this.view.scale = Math.min(Math.max(this.view.scale * factor, 1), 2000);
+    const [x2, y2] = this.toMap(px, py);
+    this.view.x += x - x2;
+    this.view.y += y - y2;
+  }
+
+  toMap(px, py) {
+    const { x, y, scale } = this.view;
+    return [x + (px - this.canvas.clientWidth / 2) / scale, y - (py - this.canvas.clientHeight / 2) / scale];
+  }
+
+  toCanvas(x, y) {
+    const view = this.view;
+    return [this.canvas.clientWidth / 2 + (x - view.x) * view.scale, this.canvas.clientHeight / 2 - (y - view.y) * view.scale];
+  }
+
+  pressed(e) {
+    if (!this.view) return;
+    this.canvas.setPointerCapture(e.pointerId);
+    const candidate = this.candidates.find(({ pose }) => {
+      const [px, py] = this.toCanvas(pose.x, pose.y);
+      return Math.hypot(px - e.offsetX, py - e.offsetY) < 14;
+    });
+    if (candidate && !this.placing) {
+      this.picked(candidate.number);
+      return;
+    }
+    this.drag = { from: [e.offsetX, e.offsetY], to: [e.offsetX, e.offsetY], view: { ...this.view } };
+  }
+
+  moved(e) {
+    if (!this.drag) return;
+    this.drag.to = [e.offsetX, e.offsetY];
+    if (!this.placing) {
+      const { from, to, view } = this.drag;
+      this.follow = false;
+      this.view.x = view.x - (to[0] - from[0]) / view.scale;
+      this.view.y = view.y + (to[1] - from[1]) / view.scale;
+    }
+  }
+
+  released() {
+    const drag = this.drag;
+    this.drag = null;
+    if (!drag || !this.placing) return;
+    const [x, y] = this.toMap(...drag.from);
+    const [dx, dy] = [drag.to[0] - drag.from[0], drag.from[1] - drag.to[1]];
+    // A click says where, but not which way: a drag of a few pixels is needed.
+    if (Math.hypot(dx, dy) > 8) this.placed(x, y, Math.atan2(dy, dx));
+  }
+
+  draw() {
+    const canvas = this.canvas;
+    const ratio = window.devicePixelRatio || 1;
+    const { clientWidth: width, clientHeight: height } = canvas;
+    if (!width || !this.snapshot) return;
+    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
+    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+    const style = getComputedStyle(document.documentElement);
+    const colour = (name) => style.getPropertyValue(name).trim();
+    const context = canvas.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.fillStyle = colour("--unknown");
+    context.fillRect(0, 0, width, height);
+    const map = this.map();
+    if (!this.fitted) this.fit();
+    if (!this.view && this.snapshot.cars[0]?.pose) {
+      this.view = { x: this.snapshot.cars[0].pose.x_m, y: this.snapshot.cars[0].pose.y_m, scale: 30 };
+    }
+    if (!this.view) return;
+    const followed = this.snapshot.cars.find((car) => car.car === this.selected)?.pose;
+    if (this.follow && followed) Object.assign(this.view, { x: followed.x_m, y: followed.y_m });
+
+    // From here on in metres of `map`, y up.
+    const { scale } = this.view;
+    const [ox, oy] = this.toCanvas(0, 0);
+    context.setTransform(ratio * scale, 0, 0, -ratio * scale, ratio * ox, ratio * oy);
+    const pixel = 1 / scale;
+    if (map) this.drawMap(context, map, pixel, colour);
+    this.snapshot.cars.forEach((car, i) => this.drawTrail(context, car, pixel, colour));
+    const selected = this.snapshot.selected;
+    if (selected && selected.car === this.selected) this.drawSelected(context, selected, pixel, colour);
+    this.snapshot.cars.forEach((car, i) => this.drawCar(context, car, i, pixel, colour));
+    for (const candidate of this.candidates) this.drawCandidate(context, candidate, pixel, colour);
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.snapshot.cars.forEach((car, i) => this.drawName(context, car, i, colour));
+    if (this.drag && this.placing) this.drawPlacing(context, colour);
+  }
+
+  drawMap(context, map, pixel, colour) {
+    context.save();
+    context.translate(map.origin.x, map.origin.y);
+    context.rotate(map.origin.heading);
+    context.scale(map.resolution, -map.resolution);
+    context.imageSmoothingEnabled = false;
+    context.drawImage(this.image(map), 0, -map.height);
+    context.restore();
+    const points = map.raceline?.points ?? [];
+    if (points.length > 2) {
+      context.beginPath();
+      points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+      context.closePath();
+      context.setLineDash([8 * pixel, 6 * pixel]);
+      context.strokeStyle = colour("--line");
+      context.lineWidth = 1.5 * pixel;
+      context.stroke();
+      context.setLineDash([]);
+    }
+  }
+
+  /// Where the car has been, in the colours of its state then.
+  drawTrail(context, car, pixel, colour) {
+    const trail = this.trails.get(car.car) ?? [];
+    context.lineWidth = 3 * pixel;
+    for (let i = 1; i < trail.length; i++) {
+      const [x0, y0] = trail[i - 1], [x1, y1, state, at] = trail[i];
+      if (Math.hypot(x1 - x0, y1 - y0) > 2) continue;
+      context.globalAlpha = Math.max(0, 0.8 * (1 - (this.snapshot.now / 1e9 - at) / TRAIL_S));
+      context.strokeStyle = colour(`--${(STATES[state] ?? STATES.INIT)[1]}`);
+      context.beginPath();
+      context.moveTo(x0, y0);
+      context.lineTo(x1, y1);
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+  }
+
+  drawSelected(context, { particles, end_points: endPoints }, pixel, colour) {
+    context.fillStyle = colour("--busy");
+    const size = 1.5 * pixel;
+    for (const [x, y, , weight] of particles) {
+      context.globalAlpha = 0.15 + 0.6 * weight;
+      context.fillRect(x - size, y - size, 2 * size, 2 * size);
+    }
+    context.globalAlpha = 1;
+    const point = 2 * pixel;
+    for (const [x, y, kind] of endPoints) {
+      context.fillStyle = colour(END_POINTS[kind] ?? "--quiet");
+      context.fillRect(x - point, y - point, 2 * point, 2 * point);
+    }
+  }
+
+  drawCar(context, car, index, pixel, colour) {
+    if (!car.pose) return;
+    const { x_m: x, y_m: y, heading_rad: heading, covariance: c } = car.pose;
+    context.globalAlpha = car.blind ? 0.35 : 1;
+    // Two sigma, along the axes of the covariance.
+    const mean = (c.xx + c.yy) / 2, half = Math.hypot((c.xx - c.yy) / 2, c.xy);
+    const [major, minor] = [Math.sqrt(Math.max(mean + half, 0)), Math.sqrt(Math.max(mean - half, 0))];
+    context.strokeStyle = colourOf(index);
+    context.lineWidth = 1.5 * pixel;
+    context.beginPath();
+    context.ellipse(x, y, 2 * major, 2 * minor, Math.atan2(2 * c.xy, c.xx - c.yy) / 2, 0, 2 * Math.PI);
+    context.stroke();
+    context.save();
+    context.translate(x, y);
+    context.rotate(heading);
+    // As large as the car is, but never too small to be seen. base_link is the rear axle.
+    const size = Math.max(1, 14 * pixel / 0.5);
+    context.scale(size, size);
+    context.beginPath();
+    context.moveTo(0.42, 0);
+    context.lineTo(-0.1, 0.16);
+    context.lineTo(-0.02, 0);
+    context.lineTo(-0.1, -0.16);
+    context.closePath();
+    context.fillStyle = car.blind ? colour("--none") : colourOf(index);
+    context.fill();
+    context.lineWidth = 2 * pixel / size;
+    context.strokeStyle = colour(`--${(STATES[car.state] ?? STATES.INIT)[1]}`);
+    context.stroke();
+    context.restore();
+    context.globalAlpha = 1;
+  }
+
+  drawName(context, car, index, colour) {
+    if (!car.pose) return;
+    const [px, py] = this.toCanvas(car.pose.x_m, car.pose.y_m);
+    context.font = `${car.car === this.selected ? "700 " : ""}13px system-ui, sans-serif`;
+    context.lineWidth = 3;
+    context.strokeStyle = colour("--ground");
+    const label = `${(STATES[car.state] ?? ["?"])[0]} ${car.car}`;
+    context.strokeText(label, px + 14, py - 10);
+    context.fillStyle = car.blind ? colour("--none") : colourOf(index);
+    context.fillText(label, px + 14, py - 10);
+  }
+
+  drawCandidate(context, { pose, number, score }, pixel, colour) {
+    context.save();
+    context.translate(pose.x, pose.y);
+    context.strokeStyle = colour("--warn");
+    context.lineWidth = 2 * pixel;
+    context.beginPath();
+    context.arc(0, 0, 12 * pixel, 0, 2 * Math.PI);
+    context.moveTo(0, 0);
+    context.lineTo(24 * pixel * Math.cos(pose.heading), 24 * pixel * Math.sin(pose.heading));
+    context.stroke();
+    context.scale(pixel, -pixel);
+    context.font = "700 13px system-ui, sans-serif";
+    context.fillStyle = colour("--warn");
+    context.fillText(`${number}: ${Math.round(score * 100)} %`, 14, -14);
+    context.restore();
+  }
+
+  drawPlacing(context, colour) {
+    const { from, to } = this.drag;
+    context.strokeStyle = colour("--warn");
+    context.fillStyle = colour("--warn");
+    context.lineWidth = 3;
+    context.beginPath();
+    context.moveTo(...from);
+    context.lineTo(...to);
+    context.stroke();
+    context.beginPath();
+    context.arc(...from, 6, 0, 2 * Math.PI);
+    context.fill();
+  }
+}

@@ -1,13 +1,15 @@
 //! The network at the pit wall: the only file, with `ask.rs`, that names zenoh.
 //!
 //! The pit wall opens a router in its own process and the cars dial it, so that no daemon is needed. A second
-//! program on the same laptop joins the first one's router as a client. What comes in is decoded once, in zenoh's
-//! own threads, and handed on as [`FleetEvent`]s; nothing here waits for those who read them.
+//! program on the same laptop joins the first one's router as a client. zenoh's threads only note when a message
+//! arrived: one that is slow to take in is one that loses messages. A thread of our own decodes each once and hands
+//! it on as a [`FleetEvent`].
 
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use crossbeam_channel::{Receiver, Sender};
 use protocol::{CarName, Key, Telemetry, Topic};
 use zenoh::handlers::Callback;
 use zenoh::qos::{CongestionControl, Priority};
@@ -134,42 +136,50 @@ pub fn unix_now() -> i64 {
 pub struct Link {
     pub(crate) session: Session,
     sink: Sink,
+    arrivals: Sender<Arrival>,
     _live: Vec<Box<dyn Send + Sync>>,
     recorded: Mutex<Vec<AdvancedSubscriber<()>>>,
 }
 
-/// Takes events in; must not wait.
+/// Takes events in, in the link's own thread: what comes meanwhile queues.
 pub type Sink = Arc<dyn Fn(FleetEvent) + Send + Sync>;
 
 impl Link {
     /// Opens the link and subscribes to everything but the full-rate streams ([`Link::subscribe_recorded`]). Needs
-    /// a multi-thread tokio runtime. `sink` gets every event, in zenoh's threads.
+    /// a multi-thread tokio runtime. `sink` gets every event.
     pub async fn open(role: &Role, sink: Sink) -> Result<Self, LinkError> {
         let session = zenoh::open(role.config()?).await.map_err(|e| LinkError::Open {
             role: role.clone(),
             reason: e.to_string(),
         })?;
+        let (arrivals, queue) = crossbeam_channel::bounded(QUEUE);
+        let out = sink.clone();
+        std::thread::Builder::new()
+            .name("decode".to_owned())
+            .spawn(move || hand_on_all(&queue, &out))
+            .map_err(LinkError::Thread)?;
         let mut live: Vec<Box<dyn Send + Sync>> = Vec::new();
         for topic in Topic::all() {
             match topic {
                 Topic::Alive => live.push(Box::new(alive(&session, &sink).await?)),
                 // Newest wins: whatever comes, as it comes.
-                Topic::Pose | Topic::Cloud | Topic::Scan => {
-                    live.push(Box::new(plain(&session, topic, &sink).await?));
+                Topic::Pose | Topic::Cloud | Topic::Scan | Topic::Load | Topic::Params => {
+                    live.push(Box::new(plain(&session, topic, &arrivals).await?));
                 }
                 // The display follows the plain subscriber: the other one holds back what comes after a gap until
                 // the gap is filled.
-                Topic::Health | Topic::Load | Topic::Params => {
-                    live.push(Box::new(plain(&session, topic, &sink).await?));
-                    live.push(Box::new(complete(&session, topic, &sink).await?));
+                Topic::Health => {
+                    live.push(Box::new(plain(&session, topic, &arrivals).await?));
+                    live.push(Box::new(complete(&session, topic, &arrivals).await?));
                 }
-                Topic::Event => live.push(Box::new(complete(&session, topic, &sink).await?)),
+                Topic::Event => live.push(Box::new(complete(&session, topic, &arrivals).await?)),
                 _ => {}
             }
         }
         Ok(Self {
             session,
             sink,
+            arrivals,
             _live: live,
             recorded: Mutex::default(),
         })
@@ -189,7 +199,7 @@ impl Link {
         let mut subscribers = Vec::new();
         if on {
             for topic in Topic::all().filter(|topic| topic.recorded()) {
-                subscribers.push(complete(&self.session, topic, &self.sink).await?);
+                subscribers.push(complete(&self.session, topic, &self.arrivals).await?);
             }
         }
         let before = std::mem::replace(
@@ -237,39 +247,72 @@ async fn alive(session: &Session, sink: &Sink) -> Result<impl Send + Sync + use<
         .map_err(|e| LinkError::subscribe(&key, &e))
 }
 
-async fn plain(session: &Session, topic: Topic, sink: &Sink) -> Result<impl Send + Sync + use<>, LinkError> {
+async fn plain(
+    session: &Session,
+    topic: Topic,
+    arrivals: &Sender<Arrival>,
+) -> Result<impl Send + Sync + use<>, LinkError> {
     let key = topic.of_all_cars();
     session
         .declare_subscriber(&key)
-        .with(take_in(Lane::Live, sink))
+        .with(take_in(Lane::Live, arrivals))
         .await
         .map_err(|e| LinkError::subscribe(&key, &e))
 }
 
-async fn complete(session: &Session, topic: Topic, sink: &Sink) -> Result<AdvancedSubscriber<()>, LinkError> {
+async fn complete(
+    session: &Session,
+    topic: Topic,
+    arrivals: &Sender<Arrival>,
+) -> Result<AdvancedSubscriber<()>, LinkError> {
     let key = topic.of_all_cars();
+    // What a car sent before it found us comes too: all its events, and of the rest the last second or two.
+    let mut history = HistoryConfig::default().detect_late_publishers();
+    if topic != Topic::Event {
+        history = history.max_samples(HISTORY);
+    }
     session
         .declare_subscriber(&key)
-        .with(take_in(Lane::Complete, sink))
+        .with(take_in(Lane::Complete, arrivals))
         .advanced()
-        // What a car sent before it found us, and what it still holds when a recording begins, comes too.
-        .history(HistoryConfig::default().detect_late_publishers())
+        .history(history)
         .recovery(RecoveryConfig::default().heartbeat())
         .await
         .map_err(|e| LinkError::subscribe(&key, &e))
 }
 
-/// Decodes a sample and hands it on.
-fn take_in(lane: Lane, sink: &Sink) -> Callback<Sample> {
-    let sink = sink.clone();
+/// Messages of a stream that are asked for when its sender is found.
+const HISTORY: usize = 100;
+/// Messages that may wait to be decoded: some ten seconds of twenty cars.
+const QUEUE: usize = 100_000;
+
+/// A message, as it arrived.
+struct Arrival {
+    at: i64,
+    lane: Lane,
+    sample: Sample,
+}
+
+fn take_in(lane: Lane, arrivals: &Sender<Arrival>) -> Callback<Sample> {
+    let arrivals = arrivals.clone();
     Callback::from(move |sample: Sample| {
+        let at = unix_now();
+        if arrivals.try_send(Arrival { at, lane, sample }).is_err() {
+            tracing::warn!("messages come faster than they can be decoded; some are lost");
+        }
+    })
+}
+
+/// Decodes what arrives and hands it on, until the link is closed.
+fn hand_on_all(arrivals: &Receiver<Arrival>, sink: &Sink) {
+    for Arrival { at, lane, sample } in arrivals {
         if sample.kind() != SampleKind::Put {
-            return;
+            continue;
         }
         // A key that is not ours cannot be told from a stranger's: no car to count it against.
         let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
             tracing::debug!(key = %sample.key_expr(), "not a key of ours");
-            return;
+            continue;
         };
         let bytes: Arc<[u8]> = sample.payload().to_bytes().into();
         let happening = match Telemetry::decode(key.topic, &bytes) {
@@ -284,14 +327,14 @@ fn take_in(lane: Lane, sink: &Sink) -> Callback<Sample> {
                 topic: key.topic,
                 error: error.to_string(),
             },
-            None => return,
+            None => continue,
         };
         sink(FleetEvent {
-            at: unix_now(),
+            at,
             car: key.car,
             happening,
         });
-    })
+    }
 }
 
 /// How questions and commands travel: ahead of telemetry, and never blocking the sender.
@@ -320,6 +363,9 @@ pub enum LinkError {
         /// What zenoh says.
         reason: String,
     },
+    /// The system gives no thread.
+    #[error("no thread to decode messages: {0}")]
+    Thread(std::io::Error),
     /// A subscription failed.
     #[error("cannot subscribe to {key}: {reason}")]
     Subscribe {

@@ -92,7 +92,7 @@ pub(crate) enum Verb {
         /// The car.
         car: CarName,
         #[command(flatten)]
-        how: Locate,
+        how: Place,
     },
     /// See or set how often a car sends what.
     Rates {
@@ -203,7 +203,7 @@ pub(crate) struct Expect {
 
 #[derive(Debug, Args)]
 #[group(required = true)]
-pub(crate) struct Locate {
+pub(crate) struct Place {
     /// Where it is: x, y [m] and heading [rad] in the map.
     #[arg(long, value_name = "X,Y,HEADING", value_parser = pose, allow_hyphen_values = true, conflicts_with_all = ["global", "pick"])]
     pub(crate) pose: Option<Pose2>,

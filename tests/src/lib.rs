@@ -1,9 +1,11 @@
 //! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
-//! protocol, and waiting for conditions.
+//! protocol, a bag of a drive in a drawn room, and waiting for conditions.
 
 mod fake_car;
+mod synthetic_bag;
 
 pub use fake_car::{Behaviour, FakeCar};
+pub use synthetic_bag::{room, true_pose, write_bag};
 
 use std::net::TcpListener;
 use std::time::{Duration, Instant};

@@ -6,13 +6,13 @@ use pitwall::{Hub, Verdict};
 use protocol::{Action, CarName, Outcome, Rates, RatesAction, RelocalizeAction, Reply};
 
 use super::{FIND, no_such_car, open};
-use crate::cli::{LinkOptions, Locate, RateOptions};
+use crate::cli::{LinkOptions, Place, RateOptions};
 use crate::output;
 
 pub(super) async fn locate(
     link: &LinkOptions,
     car: &CarName,
-    how: &Locate,
+    how: &Place,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let action = match (how.pose, how.pick) {

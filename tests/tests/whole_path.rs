@@ -1,0 +1,196 @@
+//! From a bag to the pit wall, through every part: sensors, filter, health, network, fleet, commands, recording.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use car_node::bag::{Bag, Topics};
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::source::BagPlayer;
+use pitwall::{Happening, Hub, Verdict, read_events};
+use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
+use synpf::TrackMap;
+use system_tests::{DEADLINE, free_endpoint, room, router, true_pose, wait_until, write_bag};
+
+/// Starts a car that plays the bag in `folder`.
+fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
+    let bag = folder.join("drive.mcap");
+    let grid = room();
+    if !bag.exists() {
+        write_bag(&bag, &grid, 8.0);
+    }
+    let log = Bag::read(&bag)
+        .expect("a bag")
+        .sensors(&Topics::default(), None)
+        .expect("sensors");
+    let map = RaceMap {
+        name: "room".into(),
+        map: Arc::new(TrackMap::new(grid).expect("free cells")),
+        raceline: None,
+    };
+    let car = CarName::new(name).expect("a good name");
+    let mut config = NodeConfig::new(car, map, Box::new(BagPlayer::new(bag, log)));
+    config.begin = Begin::Pose(true_pose(0.0));
+    config.connect = vec![endpoint.to_owned()];
+    Node::start(config).expect("a car")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
+    let endpoint = free_endpoint();
+    let folder = tempfile::tempdir().expect("a folder");
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let file = folder.path().join("session.mcap");
+    hub.start_recording(&file).await.expect("a new file");
+    let node = start("car-1", folder.path(), &endpoint);
+    let car = CarName::new("car-1").expect("a good name");
+    assert!(hub.wait_for(&car, DEADLINE).await, "the car shows up");
+
+    // A switch in mid-drive: done, at an update that it names, and both sides agree.
+    wait_until("two seconds of poses", || {
+        hub.fleet()
+            .car(&car)
+            .and_then(|car| car.pose)
+            .is_some_and(|(_, pose)| pose.update > 80)
+    })
+    .await;
+    let select = Action::Params(ParamsAction::Select {
+        name: "lq".into(),
+        revert_after_ms: None,
+    });
+    let verdict = hub
+        .link()
+        .command(&car, "ana", None, select)
+        .await
+        .expect("a good command");
+    let Verdict::Answered { answer, .. } = &verdict else {
+        panic!("no answer: {verdict:?}");
+    };
+    assert_eq!(
+        (verdict.exit_code(), answer.set.name.as_str()),
+        (0, "lq"),
+        "{verdict:?}"
+    );
+    wait_until("the pit wall knows the set in force", || {
+        let fleet = hub.fleet();
+        let params = fleet.car(&car).and_then(|car| car.params.as_ref());
+        params.is_some_and(|params| {
+            params.set.name == "lq" && params.revision == answer.set.revision && params.who == "ana"
+        })
+    })
+    .await;
+
+    wait_until("the bag has ended", || node.source_ended()).await;
+    // The last messages are on their way; heartbeats twice a second tell of any that got lost.
+    wait_until("the recording has every update", || {
+        let status = hub.recording().expect("a recording");
+        let updates = status
+            .summary
+            .streams
+            .iter()
+            .find(|s| s.topic == Topic::RecordedPose);
+        updates.is_some_and(|s| s.gaps.last >= 310 && s.gaps.missing == 0)
+    })
+    .await;
+    let summary = hub
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("a whole file");
+    node.shutdown("test over");
+    hub.close().await;
+    assert_eq!(summary.missing(), 0, "{summary}");
+
+    // The poses in the file, against the drive; each at the stamp that it claims.
+    let start = 1_700_000_000_000_000_000_i64;
+    let mut offsets = Vec::new();
+    let mut errors = Vec::new();
+    let mut updates = Vec::new();
+    let mut truth = Vec::new();
+    for event in read_events(&file).expect("a recording") {
+        let Happening::Message {
+            topic,
+            header,
+            telemetry,
+            ..
+        } = event.expect("a good event").happening
+        else {
+            continue;
+        };
+        match *telemetry {
+            Telemetry::Truth(true_motion) => truth.push((header.sensor, true_motion.pose)),
+            Telemetry::Pose(pose) if topic == Topic::RecordedPose => {
+                updates.push(pose.update);
+                offsets.push((header.sensor, pose.pose));
+            }
+            _ => {}
+        }
+    }
+    assert_eq!(
+        updates,
+        (updates[0]..=*updates.last().expect("poses")).collect::<Vec<_>>(),
+        "no update is missed"
+    );
+    // The player shifts the bag's stamps to now; truth beside it tells by how much.
+    let (stamp, first) = truth.first().copied().expect("truth");
+    let begun = (0..400)
+        .map(|step| f64::from(step) * 0.02)
+        .min_by(|a, b| {
+            let off = |s: f64| (true_pose(s).x - first.x).hypot(true_pose(s).y - first.y);
+            off(*a).total_cmp(&off(*b))
+        })
+        .expect("a time");
+    let shift = stamp - start - (begun * 1e9) as i64;
+    for (sensor, pose) in offsets {
+        let seconds = (sensor - shift - start) as f64 * 1e-9;
+        let expected = true_pose(seconds);
+        errors.push((pose.x - expected.x).hypot(pose.y - expected.y));
+    }
+    let rmse = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
+    // Odometry and ranges have no noise: what is left is half a cell at most.
+    assert!(
+        rmse < 0.025,
+        "position is off by {rmse:.3} m (RMSE of {} poses)",
+        errors.len()
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn three_cars_are_recorded_without_a_hole() {
+    let endpoint = free_endpoint();
+    let folder = tempfile::tempdir().expect("a folder");
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let file = folder.path().join("session.mcap");
+    hub.start_recording(&file).await.expect("a new file");
+    let nodes: Vec<_> = ["car-1", "car-2", "car-3"]
+        .map(|name| start(name, folder.path(), &endpoint))
+        .into();
+    wait_until("all bags have ended", || nodes.iter().all(Node::source_ended)).await;
+    wait_until("nothing is missing", || {
+        hub.recording().is_some_and(|s| s.summary.missing() == 0)
+    })
+    .await;
+    let summary = hub
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("a whole file");
+    for node in nodes {
+        node.shutdown("test over");
+    }
+    hub.close().await;
+    assert_eq!(summary.missing(), 0, "{summary}");
+    for topic in [
+        Topic::RecordedPose,
+        Topic::RecordedScan,
+        Topic::RecordedOdometry,
+        Topic::Event,
+        Topic::Health,
+    ] {
+        let streams: Vec<_> = summary.streams.iter().filter(|s| s.topic == topic).collect();
+        assert_eq!(streams.len(), 3, "{topic}");
+        assert!(
+            streams.iter().all(|s| s.gaps.first == 1),
+            "{topic} from its first message: {summary}"
+        );
+    }
+}

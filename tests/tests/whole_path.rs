@@ -100,13 +100,23 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
     hub.close().await;
     assert_eq!(summary.missing(), 0, "{summary}");
 
-    // The poses in the file, against the drive; each at the stamp that it claims.
+    let (rmse, poses) = position_rmse(&file);
+    // Odometry and ranges have no noise: what is left is half a cell at most.
+    assert!(
+        rmse < 0.025,
+        "position is off by {rmse:.3} m (RMSE of {poses} poses)"
+    );
+}
+
+/// How far the recorded poses are off the drive, each at the stamp that it claims [m], and how many there are. Every
+/// update must be there.
+fn position_rmse(file: &Path) -> (f64, usize) {
     let start = 1_700_000_000_000_000_000_i64;
     let mut offsets = Vec::new();
     let mut errors = Vec::new();
     let mut updates = Vec::new();
     let mut truth = Vec::new();
-    for event in read_events(&file).expect("a recording") {
+    for event in read_events(file).expect("a recording") {
         let Happening::Message {
             topic,
             header,
@@ -146,12 +156,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
         errors.push((pose.x - expected.x).hypot(pose.y - expected.y));
     }
     let rmse = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
-    // Odometry and ranges have no noise: what is left is half a cell at most.
-    assert!(
-        rmse < 0.025,
-        "position is off by {rmse:.3} m (RMSE of {} poses)",
-        errors.len()
-    );
+    (rmse, errors.len())
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -507,9 +507,9 @@ impl Localizer {
                 && self
                     .doubt
                     .lost(quality.alignment, quality.long, quality.short, seconds, recovery);
-            if lost && recovery.recover {
+            if recovery.recover && lost {
                 self.relocalize();
-            } else {
+            } else if !(recovery.recover && self.settled > 10 && self.better_elsewhere(&quality, seconds)) {
                 self.resample(ess_ratio);
             }
         }
@@ -536,6 +536,26 @@ impl Localizer {
             innovation,
             slip: self.slip.ratio,
             yaw_rate_residual: self.slip.yaw_rate,
+        }
+    }
+
+    /// Whether the scan fits another place of the map clearly better; if so, the search has begun.
+    fn better_elsewhere(&mut self, quality: &Quality, seconds: f64) -> bool {
+        if !self.doubt.asks(
+            quality.alignment,
+            self.w_ratio,
+            seconds,
+            &self.parameters.recovery,
+        ) {
+            return false;
+        }
+        match Search::second_opinion(&self.map, &self.scan, self.estimate.pose, &self.parameters) {
+            Some(search) => {
+                self.relocalize();
+                self.search = search;
+                true
+            }
+            None => false,
         }
     }
 

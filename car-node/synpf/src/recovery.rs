@@ -26,6 +26,10 @@ pub struct RecoveryParameters {
     pub lost_long_beams: f64,
     /// How long both must hold until the filter searches [s].
     pub lost_after: f64,
+    /// Ratio of the averages below which the pose is doubted, and compared with the rest of the map.
+    pub doubt_ratio: f64,
+    /// How long the doubt must last before that [s].
+    pub doubt_after: f64,
 }
 
 impl Default for RecoveryParameters {
@@ -40,6 +44,8 @@ impl Default for RecoveryParameters {
             lost_alignment: 0.45,
             lost_long_beams: 0.15,
             lost_after: 0.25,
+            doubt_ratio: 0.8,
+            doubt_after: 0.1,
         }
     }
 }
@@ -56,6 +62,8 @@ impl RecoveryParameters {
         check.range("lost_alignment", self.lost_alignment, 0.0, 1.0);
         check.range("lost_long_beams", self.lost_long_beams, 0.0, 1.0);
         check.range("lost_after", self.lost_after, 0.05, 10.0);
+        check.range("doubt_ratio", self.doubt_ratio, 0.0, 1.0);
+        check.range("doubt_after", self.doubt_after, 0.02, 10.0);
     }
 }
 
@@ -63,9 +71,17 @@ impl RecoveryParameters {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Doubt {
     averages: Option<[f64; 2]>,
-    /// Since when the pose has looked wrong [s].
+    /// For how long the pose has looked wrong [s].
     wrong_for: f64,
+    /// For how long the fit has been below what it used to be [s].
+    doubted_for: f64,
+    /// Time until the rest of the map may be looked at again [s], and how long to wait the next time.
+    patience: [f64; 2],
 }
+
+/// Comparing with the rest of the map takes as long as many updates: after each time that the pose was found to
+/// be the best one, the filter waits twice as long, up to this [s].
+const MOST_PATIENCE: f64 = 4.0;
 
 impl Doubt {
     /// Takes in the likelihood of a scan, any positive measure whose ratio means something. Returns
@@ -101,6 +117,33 @@ impl Doubt {
         self.wrong_for > parameters.lost_after - 1e-3
     }
 
+    /// True when the scan has fitted worse than before for long enough to ask whether another place fits better.
+    /// `ratio` is `w_fast / w_slow`. An opponent in view looks the same at first; the comparison tells them apart.
+    pub(crate) fn asks(
+        &mut self,
+        alignment: f64,
+        ratio: f64,
+        seconds: f64,
+        parameters: &RecoveryParameters,
+    ) -> bool {
+        let [wait, next] = self.patience;
+        self.patience[0] = (wait - seconds).max(0.0);
+        if ratio > parameters.doubt_ratio || alignment > 0.85 {
+            self.doubted_for = 0.0;
+            if ratio > 0.95 {
+                self.patience[1] = 0.0;
+            }
+            return false;
+        }
+        self.doubted_for += seconds;
+        if self.doubted_for < parameters.doubt_after - 1e-3 || self.patience[0] > 0.0 {
+            return false;
+        }
+        let wait = (2.0 * next).clamp(0.1, MOST_PATIENCE);
+        self.patience = [wait, wait];
+        true
+    }
+
     /// Starts anew, because the pose has been set or found.
     pub(crate) fn clear(&mut self) {
         *self = Self::default();
@@ -127,6 +170,25 @@ mod tests {
             ratio = doubt.push(0.2, &parameters);
         }
         assert!(ratio > 0.95, "{ratio}");
+    }
+
+    #[test]
+    fn the_map_is_asked_soon_and_then_less_and_less() {
+        let parameters = RecoveryParameters::default();
+        let mut doubt = Doubt::default();
+        let asked: Vec<usize> = (0..400)
+            .filter(|_| doubt.asks(0.5, 0.6, 0.025, &parameters))
+            .collect();
+        assert_eq!(asked[0], 3);
+        let pauses: Vec<usize> = asked.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        assert!(
+            pauses.windows(2).all(|pair| pair[0] <= pair[1]) && asked.len() < 9,
+            "{asked:?}"
+        );
+        assert!(
+            !doubt.asks(0.95, 0.6, 1.0, &parameters),
+            "a scan that fits raises no doubt"
+        );
     }
 
     #[test]

@@ -76,8 +76,8 @@ pub(crate) struct Search {
 /// How long one scan is remembered in a score [s].
 const MEMORY: f64 = 0.5;
 
-/// How often new candidates join while none is confirmed [s].
-const RESEED: f64 = 0.4;
+/// How often new candidates join while none is confirmed [s]: soon if none explains the scan, else seldom.
+const RESEED: [f64; 2] = [0.3, 1.0];
 
 /// A candidate worse than the best by this is dropped.
 const HOPELESS: f64 = 12.0;
@@ -85,8 +85,14 @@ const HOPELESS: f64 = 12.0;
 /// Candidates nearer than this are one [m], [rad].
 const SAME: [f64; 2] = [0.3, 0.2];
 
-/// Beams that the coarse match and the score look at.
+/// Beams that the score looks at.
 const BEAMS: usize = 60;
+
+/// Beams that the coarse match looks at.
+const COARSE_BEAMS: usize = 36;
+
+/// Coarse poses that are looked through for the best of each neighbourhood.
+const COARSE: usize = 6000;
 
 /// Neighbouring beams err together: the score counts this many as independent.
 const INDEPENDENT: f64 = 20.0;
@@ -124,7 +130,8 @@ impl Search {
             candidate.scans += 1;
             candidate.score += share * (score - candidate.score);
         });
-        if self.candidates.is_empty() || self.since_seeding >= RESEED {
+        let explained = self.candidates.iter().any(|candidate| explains(candidate.score));
+        if self.candidates.is_empty() || self.since_seeding >= RESEED[usize::from(explained)] {
             self.since_seeding = 0.0;
             self.candidates.extend(seed(map, scan, parameters));
         }
@@ -167,9 +174,32 @@ impl Search {
         } else {
             3.0 * parameters.search.search_margin
         };
-        let well = best.score > INDEPENDENT * 0.35f64.ln();
-        (best.scans >= 6 && well && margin >= needed).then_some(best.estimate)
+        (best.scans >= 6 && explains(best.score) && margin >= needed).then_some(best.estimate)
     }
+
+    /// Looks for a pose elsewhere that explains a scan clearly better than `pose` does; with what was found, a
+    /// search can begin.
+    pub(crate) fn second_opinion(
+        map: &TrackMap,
+        scan: &ReadyScan,
+        pose: Pose,
+        parameters: &Parameters,
+    ) -> Option<Self> {
+        let mut search = Self {
+            candidates: seed(map, scan, parameters),
+            ..Self::default()
+        };
+        search.rank(parameters.search.search_candidates);
+        let best = search.candidates.first()?;
+        let own = score(map, scan, pose);
+        let elsewhere = !same(best.estimate.pose, pose);
+        (elsewhere && best.score >= own + parameters.search.search_margin).then_some(search)
+    }
+}
+
+/// Whether a score is that of a pose which explains a scan, at least in good part.
+fn explains(score: f64) -> bool {
+    score > INDEPENDENT * 0.35f64.ln()
 }
 
 fn same(a: Pose, b: Pose) -> bool {
@@ -206,7 +236,7 @@ fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candid
         .map(|(column, row, _)| [column as f32 + 0.5, row as f32 + 0.5])
         .collect();
     let headings = (std::f64::consts::TAU / parameters.search.search_turn).ceil() as usize;
-    let stride = scan.points.len().div_ceil(BEAMS).max(1);
+    let stride = scan.points.len().div_ceil(COARSE_BEAMS).max(1);
     let cells = 1.0 / resolution as f32;
     // How far off a coarse pose is [m], over which an end point still counts.
     let reach = parameters.search.search_step as f32;
@@ -239,6 +269,10 @@ fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candid
                 .collect::<Vec<_>>()
         })
         .collect();
+    if coarse.len() > COARSE {
+        coarse.select_nth_unstable_by(COARSE, |a, b| b.0.total_cmp(&a.0));
+        coarse.truncate(COARSE);
+    }
     coarse.sort_by(|a, b| b.0.total_cmp(&a.0));
     // The best of each neighbourhood.
     let most = 3 * parameters.search.search_candidates;

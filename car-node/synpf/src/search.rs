@@ -5,7 +5,9 @@
 //! of the fine ones), the best candidates are kept, and each follows odometry and the next scans on its own until
 //! one of them explains all of it clearly better than the rest.
 
-use maps::{Pose, wrap_angle};
+use std::cmp::Ordering;
+
+use maps::{DistanceField, OccupancyGrid, Pose, wrap_angle};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -35,7 +37,7 @@ impl Default for SearchParameters {
     fn default() -> Self {
         Self {
             search_step: 0.2,
-            search_turn: 0.0873,
+            search_turn: 0.0524,
             search_candidates: 40,
             search_margin: 2.0,
             search_distance: 0.5,
@@ -218,13 +220,75 @@ fn score(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
     INDEPENDENT * fit(map.field(), &scan.points, BEAMS, pose, 0.08).max(0.02).ln()
 }
 
+/// How near a wall is, coarsely and in few bytes, so that a whole map stays in a processor's cache while every
+/// pose is tried on it.
+#[derive(Debug)]
+pub(crate) struct CoarseField {
+    width: usize,
+    /// 255 on a wall, a half at [`COARSE_REACH`], falling to 0.
+    nearness: Vec<u8>,
+    /// Edge of a coarse cell [m].
+    resolution: f32,
+}
+
+/// Distance from a wall at which an end point counts half in the coarse match [m]: as far off as a coarse pose is.
+const COARSE_REACH: f32 = 0.2;
+
+/// Coarse cells are at least this large [m].
+const COARSE_CELL: f64 = 0.1;
+
+impl CoarseField {
+    pub(crate) fn new(grid: &OccupancyGrid, field: &DistanceField) -> Self {
+        let factor = (COARSE_CELL / grid.resolution).round().max(1.0) as usize;
+        let (width, height) = (grid.width.div_ceil(factor), grid.height.div_ceil(factor));
+        let nearest = |index: usize| {
+            let (column, row) = (index % width * factor, index / width * factor);
+            let columns = column..(column + factor).min(grid.width);
+            let rows = row..(row + factor).min(grid.height);
+            let cells = rows.flat_map(|row| columns.clone().map(move |column| row * grid.width + column));
+            cells
+                .map(|cell| field.values()[cell].abs())
+                .fold(f32::INFINITY, f32::min)
+        };
+        let nearness = (0..width * height)
+            .map(|index| {
+                let ratio = nearest(index) / COARSE_REACH;
+                (255.0 / (1.0 + ratio * ratio)) as u8
+            })
+            .collect();
+        Self {
+            width,
+            nearness,
+            resolution: (grid.resolution * factor as f64) as f32,
+        }
+    }
+
+    /// Nearness at a point in coarse cells, 0 outside.
+    #[inline]
+    fn at(&self, u: f32, v: f32) -> u32 {
+        // Negative coordinates become 0 and lie outside or in the rim; a column beyond the width is caught.
+        let (column, row) = (u as usize, v as usize);
+        if column >= self.width || u < 0.0 || v < 0.0 {
+            return 0;
+        }
+        self.nearness
+            .get(row * self.width + column)
+            .map_or(0, |&nearness| u32::from(nearness))
+    }
+}
+
+/// Least mean nearness of a coarse pose that is looked at again.
+const LEAST_NEARNESS: f32 = 0.3;
+
 /// Candidates from one scan alone: every position and heading tried coarsely, the best refined.
 fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candidate> {
     let field = map.field();
+    let coarse_field = map.coarse_field();
     let resolution = map.grid().resolution;
     let width = map.grid().width;
     let step = (parameters.search.search_step / resolution).round().max(1.0) as usize;
     let clearance = 0.12f32;
+    let per_cell = resolution as f32 / coarse_field.resolution;
     let positions: Vec<[f32; 2]> = map
         .plausible_regions()
         .into_iter()
@@ -233,47 +297,61 @@ fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candid
         .filter(|&(column, row, cell)| {
             column % step == 0 && row % step == 0 && field.values()[cell] > clearance
         })
-        .map(|(column, row, _)| [column as f32 + 0.5, row as f32 + 0.5])
+        .map(|(column, row, _)| [(column as f32 + 0.5) * per_cell, (row as f32 + 0.5) * per_cell])
         .collect();
     let headings = (std::f64::consts::TAU / parameters.search.search_turn).ceil() as usize;
     let stride = scan.points.len().div_ceil(COARSE_BEAMS).max(1);
-    let cells = 1.0 / resolution as f32;
-    // How far off a coarse pose is [m], over which an end point still counts.
-    let reach = parameters.search.search_step as f32;
-    let mut coarse: Vec<(f32, Pose)> = (0..headings)
+    // Spread over the field of view in both halves, so that a look at the first half tells.
+    let looked_at = || scan.points.iter().step_by(stride);
+    let ordered: Vec<[f32; 2]> = looked_at()
+        .step_by(2)
+        .chain(looked_at().skip(1).step_by(2))
+        .copied()
+        .collect();
+    let cells = 1.0 / coarse_field.resolution;
+    let half = ordered.len() / 2;
+    let least = |points: usize| (LEAST_NEARNESS * 255.0 * points as f32) as u32;
+    let mut coarse: Vec<(u32, Pose)> = (0..headings)
         .into_par_iter()
         .flat_map_iter(|k| {
             let heading = k as f64 / headings as f64 * std::f64::consts::TAU;
             let (sin, cos) = (heading.sin() as f32 * cells, heading.cos() as f32 * cells);
-            let turned: Vec<[f32; 2]> = scan
-                .points
+            let turned: Vec<[f32; 2]> = ordered
                 .iter()
-                .step_by(stride)
                 .map(|p| [cos * p[0] - sin * p[1], sin * p[0] + cos * p[1]])
                 .collect();
-            let per_point = 1.0 / turned.len() as f32;
-            positions
-                .iter()
-                .map(|at| {
-                    let mut sum = 0.0;
-                    for point in &turned {
-                        if let Some(distance) = field.nearest(at[0] + point[0], at[1] + point[1]) {
-                            let ratio = distance / reach;
-                            sum += 1.0 / (1.0 + ratio * ratio);
-                        }
-                    }
-                    let [x, y] = at.map(|v| f64::from(v) * resolution);
-                    (sum * per_point, Pose::new(x, y, heading))
-                })
-                .filter(|&(fit, _)| fit > 0.3)
-                .collect::<Vec<_>>()
+            let sum = |at: &[f32; 2], points: &[[f32; 2]]| -> u32 {
+                points
+                    .iter()
+                    .map(|point| coarse_field.at(at[0] + point[0], at[1] + point[1]))
+                    .sum()
+            };
+            let mut good = Vec::new();
+            for at in &positions {
+                let first = sum(at, &turned[..half]);
+                // Most poses are hopeless after half of the beams.
+                if first * 3 < least(half) * 2 {
+                    continue;
+                }
+                let whole = first + sum(at, &turned[half..]);
+                if whole >= least(turned.len()) {
+                    let [x, y] = at.map(|v| f64::from(v * coarse_field.resolution));
+                    good.push((whole, Pose::new(x, y, heading)));
+                }
+            }
+            good
         })
         .collect();
     if coarse.len() > COARSE {
-        coarse.select_nth_unstable_by(COARSE, |a, b| b.0.total_cmp(&a.0));
+        coarse.select_nth_unstable_by(COARSE, |a, b| b.0.cmp(&a.0));
         coarse.truncate(COARSE);
     }
-    coarse.sort_by(|a, b| b.0.total_cmp(&a.0));
+    // Ties in the order of the poses, which does not depend on the number of threads.
+    let key = |pose: &Pose| [pose.x, pose.y, pose.heading];
+    coarse.sort_by(|a, b| {
+        b.0.cmp(&a.0)
+            .then_with(|| key(&a.1).partial_cmp(&key(&b.1)).unwrap_or(Ordering::Equal))
+    });
     // The best of each neighbourhood.
     let most = 3 * parameters.search.search_candidates;
     let mut picked: Vec<Pose> = Vec::with_capacity(most);

@@ -7,6 +7,7 @@ use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::range_table::{RangeTable, TableParameters};
+use crate::search::CoarseField;
 use crate::sensor::RangeMethod;
 use crate::{Parameters, SetUpError};
 
@@ -25,6 +26,7 @@ pub struct TrackMap {
     region_of: Vec<u16>,
     tables: Mutex<HashMap<(usize, TableParameters), Arc<RangeTable>>>,
     cddt: OnceLock<Arc<Cddt>>,
+    coarse_field: OnceLock<CoarseField>,
 }
 
 /// A connected piece of free space.
@@ -65,6 +67,7 @@ impl TrackMap {
             region_of,
             tables: Mutex::default(),
             cddt: OnceLock::new(),
+            coarse_field: OnceLock::new(),
         })
     }
 
@@ -138,6 +141,11 @@ impl TrackMap {
 
     pub(crate) fn cddt(&self) -> Arc<Cddt> {
         Arc::clone(self.cddt.get_or_init(|| Arc::new(Cddt::new(&self.field))))
+    }
+
+    pub(crate) fn coarse_field(&self) -> &CoarseField {
+        self.coarse_field
+            .get_or_init(|| CoarseField::new(&self.grid, &self.field))
     }
 
     pub(crate) fn grid_from_map(&self) -> Pose {

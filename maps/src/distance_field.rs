@@ -189,11 +189,17 @@ impl DistanceField {
 /// Grey levels at which the walls' faces are taken.
 const LEVELS: [u8; 3] = [64, 128, 191];
 
-/// How solid each cell is, 0 to 255: its grey if it is known or lies on a wall's face, else solid, because a car
-/// that leaves the mapped space is no better off than in a wall.
+/// How solid each cell is, 0 to 255. The grey of a cell counts where it lies on a wall's face: an unknown cell
+/// between free and occupied ones, or an occupied one beside a darker. Other unknown cells are solid, because a car
+/// that leaves the mapped space is no better off than in a wall; other occupied ones too, however pale the map is.
 fn solidity(grid: &OccupancyGrid) -> Vec<u8> {
-    let on_face = |column: i64, row: i64| {
-        let (mut free, mut occupied) = (false, false);
+    let solid = |(i, &cell): (usize, &Cell)| {
+        let occupancy = grid.occupancy[i];
+        if cell == Cell::Free || occupancy == u8::MAX {
+            return occupancy;
+        }
+        let (column, row) = ((i % grid.width) as i64, (i / grid.width) as i64);
+        let (mut free, mut darkest) = (false, None);
         for (dc, dr) in [
             (-1, -1),
             (0, -1),
@@ -206,15 +212,18 @@ fn solidity(grid: &OccupancyGrid) -> Vec<u8> {
         ] {
             match grid.cell(column + dc, row + dr) {
                 Cell::Free => free = true,
-                Cell::Occupied => occupied = true,
+                Cell::Occupied => {
+                    let beside = grid.occupancy[(row + dr) as usize * grid.width + (column + dc) as usize];
+                    darkest = darkest.max(Some(beside));
+                }
                 Cell::Unknown => {}
             }
         }
-        free && occupied
-    };
-    let solid = |(i, &cell): (usize, &Cell)| match cell {
-        Cell::Unknown if !on_face((i % grid.width) as i64, (i / grid.width) as i64) => u8::MAX,
-        _ => grid.occupancy[i],
+        let on_face = match cell {
+            Cell::Unknown => free && darkest.is_some(),
+            _ => darkest.is_some_and(|darkest| darkest > occupancy),
+        };
+        if on_face { occupancy } else { u8::MAX }
     };
     grid.cells.iter().enumerate().map(solid).collect()
 }
@@ -316,6 +325,7 @@ mod tests {
         let half = face(&grid);
         for i in [3, 9, 15] {
             grid.occupancy[i] = 230;
+            grid.cells[i] = Cell::Occupied;
         }
         assert!((face(&grid) - 1.0).abs() < 1e-6, "a nearly black cell is wall");
         assert!(half > 1.0 && half < 2.0, "a grey one is half wall: {half}");
@@ -335,6 +345,16 @@ mod tests {
         // Two blocks that touch at a corner.
         let saddle = DistanceField::new(&drawn(&["##..", "##..", "..##", "..##"])).contour();
         assert!(saddle.len() >= 4);
+    }
+
+    #[test]
+    fn a_pale_wall_is_a_wall() {
+        let mut grid = drawn(&["....##", "....##", "....##"]);
+        grid.occupancy
+            .iter_mut()
+            .filter(|occupancy| **occupancy == 255)
+            .for_each(|grey| *grey = 180);
+        assert!((DistanceField::new(&grid).distance([2.0, 1.5]) - 2.0).abs() < 1e-6);
     }
 
     #[test]

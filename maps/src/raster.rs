@@ -36,9 +36,14 @@ impl Raster {
         self.mean(&pixel[..self.colours()])
     }
 
-    /// Mean of *all* channels in [0, 1], alpha counted as one more colour, as `map_server` does in trinary mode
-    /// (a grey pixel with alpha is red = green = blue there).
+    /// Mean of *all* channels in [0, 1] where the image is transparent, alpha counted as one more colour as
+    /// `map_server` does in trinary mode (a grey pixel with alpha is red = green = blue there). Where it is opaque
+    /// alpha says nothing and is left out; `map_server` counts it, and so takes the unknown grey 205 of an image
+    /// with an alpha channel for free space.
     pub(crate) fn brightness_with_alpha(&self, index: usize) -> f64 {
+        if self.opaque(index) {
+            return self.brightness(index);
+        }
         match self.pixel(index) {
             &[grey, alpha] => self.mean(&[grey, grey, grey, alpha]),
             pixel => self.mean(pixel),
@@ -248,14 +253,21 @@ mod tests {
     }
 
     #[test]
-    fn alpha_counts_as_a_colour_only_where_asked() {
-        let rgba = encode(png::ColorType::Rgba, png::BitDepth::Eight, 1, &[0, 0, 0, 255]);
-        let grey = encode(png::ColorType::GrayscaleAlpha, png::BitDepth::Eight, 1, &[0, 255]);
-        for bytes in [rgba, grey] {
-            let raster = Raster::decode("test", &bytes).expect("a valid image");
-            assert!((raster.brightness(0) - 0.0).abs() < 1e-12);
-            assert!((raster.brightness_with_alpha(0) - 0.25).abs() < 1e-12);
-            assert!(raster.opaque(0));
+    fn alpha_counts_as_a_colour_only_where_something_shows_through() {
+        for (alpha, expected) in [(255, 0.0), (0, 0.0), (102, 0.1)] {
+            let rgba = encode(png::ColorType::Rgba, png::BitDepth::Eight, 1, &[0, 0, 0, alpha]);
+            let grey = encode(
+                png::ColorType::GrayscaleAlpha,
+                png::BitDepth::Eight,
+                1,
+                &[0, alpha],
+            );
+            for bytes in [rgba, grey] {
+                let raster = Raster::decode("test", &bytes).expect("a valid image");
+                assert!((raster.brightness(0) - 0.0).abs() < 1e-12);
+                assert!((raster.brightness_with_alpha(0) - expected).abs() < 1e-12);
+                assert_eq!(raster.opaque(0), alpha == 255);
+            }
         }
     }
 

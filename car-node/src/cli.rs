@@ -29,6 +29,12 @@ pub(crate) enum Command {
     ///
     /// Results go to stdout, progress to stderr. The same bag, set and seed give the same poses.
     Evaluate(Evaluate),
+    /// Race simulated cars that drive on the filter's estimates, and hold the laps against the paper's.
+    ///
+    /// The same seed is the same race; only the load differs from run to run.
+    Race(Race),
+    /// Make, check or draw a track.
+    Track(Track),
 }
 
 /// Where the sensor data comes from.
@@ -151,6 +157,136 @@ pub(crate) struct Evaluate {
     /// One JSON object on stdout; an array of them for several bags or seeds.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+/// Arguments of `race`.
+#[derive(Debug, Args)]
+pub(crate) struct Race {
+    /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
+    #[arg(long, value_name = "NAME|FOLDER|MAP.yaml", default_value = "club")]
+    pub(crate) track: String,
+    /// Laps for every car.
+    #[arg(long, value_name = "N", default_value = "10", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub(crate) laps: u32,
+    /// Grip: hq (26 N of lateral pull) or lq (19 N: the tyres slip, and odometry lies).
+    #[arg(long, value_enum, default_value = "hq")]
+    pub(crate) odometry: Odometry,
+    /// Parameter set of the filter: hq, lq, adaptive, synpf-baseline, or a YAML file.
+    #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
+    pub(crate) params: String,
+    /// What tells the driver where the car is.
+    #[arg(long, value_enum, default_value = "synpf")]
+    pub(crate) localizer: Guide,
+    /// Cars on the track, each with a localizer of its own.
+    #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=20))]
+    pub(crate) cars: u8,
+    /// Races to run, with seeds 0, 1, 2, ...
+    #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub(crate) seeds: u64,
+    /// First seed.
+    #[arg(long, value_name = "N", default_value = "0")]
+    pub(crate) seed: u64,
+    /// Speed over the raceline's own.
+    #[arg(long, value_name = "FACTOR", default_value = "1.0", value_parser = speed)]
+    pub(crate) speed: f64,
+    /// Run the paper's grid (every localizer on both tyres) and print it beside the paper's table I.
+    #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars"])]
+    pub(crate) table: bool,
+    /// One JSON object on stdout; an array of rows with --table.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// What the driver goes by, as an argument.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Guide {
+    /// The filter, with the set that --params names.
+    Synpf,
+    /// The filter with the reference's behaviour, whatever --params says.
+    SynpfBaseline,
+    /// Wheel odometry alone.
+    Odometry,
+    /// The true pose.
+    Truth,
+}
+
+/// Arguments of `track`.
+#[derive(Debug, Args)]
+pub(crate) struct Track {
+    /// What to do with it.
+    #[command(subcommand)]
+    pub(crate) command: TrackCommand,
+}
+
+/// What can be done with a track.
+#[derive(Debug, Subcommand)]
+pub(crate) enum TrackCommand {
+    /// Make a track: map.yaml, map.png, raceline.csv, walls.csv and its description, track.yaml.
+    New {
+        /// Folder to write to.
+        #[arg(value_name = "FOLDER")]
+        folder: PathBuf,
+        /// Description to make it from [default: a random one].
+        #[arg(long, value_name = "TRACK.yaml", conflicts_with_all = ["length", "width", "seed"])]
+        from: Option<PathBuf>,
+        /// Length of a random track's lap, about [m].
+        #[arg(long, value_name = "METRES", default_value = "50", value_parser = lap_length)]
+        length: f64,
+        /// Width of a random track [m].
+        #[arg(long, value_name = "METRES", default_value = "2", value_parser = track_width)]
+        width: f64,
+        /// Seed of a random track.
+        #[arg(long, value_name = "N", default_value = "0")]
+        seed: u64,
+        /// Overwrite what is there.
+        #[arg(long)]
+        force: bool,
+        /// One JSON object on stdout.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Check that a track can be raced on: exit code 1 and every fault if not.
+    Check {
+        /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
+        #[arg(value_name = "NAME|FOLDER|MAP.yaml")]
+        track: String,
+        /// One JSON object on stdout.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Draw a track in the terminal, or as an SVG file.
+    Draw {
+        /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
+        #[arg(value_name = "NAME|FOLDER|MAP.yaml")]
+        track: String,
+        /// Write an SVG file: walls, map and raceline coloured by speed.
+        #[arg(long, value_name = "FILE.svg")]
+        svg: Option<PathBuf>,
+        /// Columns to draw in.
+        #[arg(long, value_name = "N", default_value = "100", value_parser = clap::value_parser!(u16).range(20..=400))]
+        columns: u16,
+    },
+}
+
+/// A number within a range, or what the range is.
+fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (least..=most).contains(&value) => Ok(value),
+        Ok(value) => Err(format!("{value} should lie in [{least}, {most}]")),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+fn speed(text: &str) -> Result<f64, String> {
+    within(text, 0.1, 2.0)
+}
+
+fn lap_length(text: &str) -> Result<f64, String> {
+    within(text, 20.0, 500.0)
+}
+
+fn track_width(text: &str) -> Result<f64, String> {
+    within(text, 1.2, 6.0)
 }
 
 /// `x,y,heading`.

@@ -17,6 +17,7 @@ pub mod node;
 pub mod outbox;
 pub mod proposal;
 pub mod publisher;
+pub mod race;
 pub mod ros;
 pub mod sets;
 pub mod source;

@@ -2,6 +2,7 @@
 
 mod cli;
 mod commands;
+mod drawing;
 
 use std::process::ExitCode;
 
@@ -18,6 +19,8 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(arguments) => commands::run::run(&arguments),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
+        Command::Race(arguments) => commands::race::run(&arguments),
+        Command::Track(arguments) => commands::track::run(&arguments.command),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -6,7 +6,9 @@
 )]
 
 pub(crate) mod evaluate;
+pub(crate) mod race;
 pub(crate) mod run;
+pub(crate) mod track;
 
 use std::path::Path;
 

@@ -1,0 +1,294 @@
+//! `car-node race`.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context;
+use car_node::race::{CarResult, Guide, MeanSigma, PAPER_ROWS, Quality, RaceSetup, RaceSummary, race};
+use indicatif::{ProgressBar, ProgressStyle};
+use rayon::prelude::*;
+use serde::Serialize;
+use simulator::Track;
+use synpf::{Parameters, TrackMap};
+
+use super::load_set;
+use crate::cli;
+
+/// Some races of one kind, as reported.
+#[derive(Debug, Serialize)]
+struct Report {
+    track: String,
+    localizer: String,
+    odometry: Quality,
+    laps_each: u32,
+    seeds: Vec<u64>,
+    summary: RaceSummary,
+    /// By seed, then by car; left out of tables.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    races: Vec<Vec<CarResult>>,
+}
+
+pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
+    let track = Arc::new(Track::find(&arguments.track)?);
+    let map = TrackMap::new(track.grid.clone()).with_context(|| arguments.track.clone())?;
+    let map = Arc::new(map);
+    if arguments.table {
+        return table(arguments, &track, &map);
+    }
+    let (localizer, guide) = chosen(arguments)?;
+    let quality = match arguments.odometry {
+        cli::Odometry::Hq => Quality::Hq,
+        cli::Odometry::Lq => Quality::Lq,
+    };
+    let report = races(arguments, &track, &map, localizer, guide, quality)?;
+    if arguments.json {
+        println!("{}", serde_json::to_string_pretty(&report)?);
+    } else {
+        print_one(&report);
+    }
+    Ok(())
+}
+
+/// What the arguments ask for, and what to call it.
+fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, Guide)> {
+    Ok(match arguments.localizer {
+        cli::Guide::Synpf => {
+            let set = load_set(&arguments.params)?;
+            (format!("synpf {}", set.name), Guide::SynPf(set.parameters))
+        }
+        cli::Guide::SynpfBaseline => shipped("synpf-baseline")?,
+        cli::Guide::Odometry => ("odometry".into(), Guide::Odometry),
+        cli::Guide::Truth => ("truth".into(), Guide::Truth),
+    })
+}
+
+fn shipped(name: &str) -> anyhow::Result<(String, Guide)> {
+    let parameters = Parameters::named(name).with_context(|| format!("no parameter set {name}"))?;
+    let title = if name.starts_with("synpf") {
+        name.into()
+    } else {
+        format!("synpf {name}")
+    };
+    Ok((title, Guide::SynPf(parameters)))
+}
+
+/// One race for each seed, side by side on the machine's cores.
+fn races(
+    arguments: &cli::Race,
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    localizer: String,
+    guide: Guide,
+    quality: Quality,
+) -> anyhow::Result<Report> {
+    let seeds: Vec<u64> = (0..arguments.seeds).map(|i| arguments.seed + i).collect();
+    let setup = RaceSetup {
+        laps: arguments.laps,
+        cars: arguments.cars.into(),
+        quality,
+        guide,
+        speed_scale: arguments.speed,
+        seed: 0,
+    };
+    let progress = progress_bar(seeds.len() as u64, &localizer, quality);
+    let races = seeds
+        .par_iter()
+        .map(|&seed| {
+            let result = race(
+                track,
+                map,
+                &RaceSetup {
+                    seed,
+                    ..setup.clone()
+                },
+            );
+            progress.inc(1);
+            result
+        })
+        .collect::<Result<Vec<_>, _>>()?;
+    progress.finish_and_clear();
+    let cars: Vec<CarResult> = races.iter().flatten().cloned().collect();
+    Ok(Report {
+        track: track.name.clone(),
+        localizer,
+        odometry: quality,
+        laps_each: arguments.laps,
+        seeds,
+        summary: RaceSummary::of(&cars),
+        races,
+    })
+}
+
+fn progress_bar(races: u64, localizer: &str, quality: Quality) -> ProgressBar {
+    let bar = ProgressBar::new(races);
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} races") {
+        bar.set_style(style);
+    }
+    bar.enable_steady_tick(Duration::from_millis(250));
+    bar.set_message(format!("{localizer} {}", name(quality)));
+    bar
+}
+
+fn name(quality: Quality) -> &'static str {
+    match quality {
+        Quality::Hq => "HQ",
+        Quality::Lq => "LQ",
+    }
+}
+
+/// The paper's grid.
+fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyhow::Result<()> {
+    let rows = [
+        ("hq", Quality::Hq),
+        ("lq", Quality::Lq),
+        ("synpf-baseline", Quality::Hq),
+        ("synpf-baseline", Quality::Lq),
+    ]
+    .map(|(set, quality)| shipped(set).map(|(localizer, guide)| (localizer, guide, quality)));
+    let mut rows = rows.into_iter().collect::<anyhow::Result<Vec<_>>>()?;
+    for quality in [Quality::Hq, Quality::Lq] {
+        rows.push(("odometry".into(), Guide::Odometry, quality));
+    }
+    for quality in [Quality::Hq, Quality::Lq] {
+        rows.push(("truth".into(), Guide::Truth, quality));
+    }
+    let mut reports = Vec::new();
+    for (localizer, guide, quality) in rows {
+        let mut report = races(arguments, track, map, localizer, guide, quality)?;
+        report.races.clear();
+        reports.push(report);
+    }
+    if arguments.json {
+        println!("{}", serde_json::to_string_pretty(&reports)?);
+    } else {
+        print_table(arguments, &reports);
+    }
+    Ok(())
+}
+
+/// A value or a dash.
+fn or_dash(value: Option<f64>, scale: f64, digits: usize) -> String {
+    value.map_or("-".into(), |v| format!("{:.digits$}", v * scale))
+}
+
+fn mean_sigma(value: Option<MeanSigma>, scale: f64, digits: usize) -> String {
+    value.map_or("-".into(), |v| {
+        format!("{:.digits$} ± {:.digits$}", v.mean * scale, v.sigma * scale)
+    })
+}
+
+fn print_table(arguments: &cli::Race, reports: &[Report]) {
+    println!(
+        "{} laps on {}, {} seed(s)",
+        arguments.laps,
+        reports.first().map_or("", |report| &report.track),
+        arguments.seeds
+    );
+    println!(
+        "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+        "localizer",
+        "odom",
+        "lap time",
+        "error to line",
+        "align paper",
+        "ours",
+        "pos rmse",
+        "hdg rmse",
+        "load",
+        "crashes"
+    );
+    println!(
+        "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+        "", "", "s", "cm", "%", "%", "cm", "deg", "% core", ""
+    );
+    for report in reports {
+        let s = &report.summary;
+        println!(
+            "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7.2} {:>8}",
+            report.localizer,
+            name(report.odometry),
+            mean_sigma(s.lap_time_s, 1.0, 3),
+            mean_sigma(s.line_error_m, 100.0, 2),
+            or_dash(s.alignment_paper, 100.0, 2),
+            or_dash(s.alignment, 100.0, 2),
+            or_dash(s.position_rmse_m, 100.0, 2),
+            or_dash(s.heading_rmse_rad, 1_f64.to_degrees(), 2),
+            s.load.cpu * 100.0,
+            crashes(s),
+        );
+    }
+    println!("the paper, table I (10 laps of a real car on its own track):");
+    for row in PAPER_ROWS {
+        let pair = |[mean, sigma]: [f64; 2]| Some(MeanSigma { mean, sigma });
+        println!(
+            "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+            row.localizer,
+            name(row.quality),
+            mean_sigma(pair(row.lap_time_s), 1.0, 3),
+            mean_sigma(pair(row.line_error_m), 100.0, 2),
+            or_dash(Some(row.alignment), 100.0, 2),
+            "-",
+            "-",
+            "-",
+            or_dash(row.load, 1.0, 2),
+            "-"
+        );
+    }
+}
+
+/// Crashes, and who did not finish.
+fn crashes(summary: &RaceSummary) -> String {
+    if summary.finished == summary.started {
+        summary.crashes.to_string()
+    } else {
+        format!("{} (dnf)", summary.crashes)
+    }
+}
+
+fn print_one(report: &Report) {
+    let s = &report.summary;
+    println!(
+        "{}  {}, {} odometry, {} laps, {} of {} cars finished",
+        report.track,
+        report.localizer,
+        name(report.odometry),
+        report.laps_each,
+        s.finished,
+        s.started
+    );
+    let line = |name: &str, value: String, unit: &str| println!("  {name:<22} {value:>17}  {unit}");
+    line("lap time", mean_sigma(s.lap_time_s, 1.0, 3), "s");
+    line(
+        "estimate to line",
+        mean_sigma(s.line_error_m, 100.0, 2),
+        "cm, as the paper takes it",
+    );
+    line("car to line", mean_sigma(s.true_line_error_m, 100.0, 2), "cm");
+    line("position error", or_dash(s.position_rmse_m, 100.0, 2), "cm rmse");
+    line("position error, max", or_dash(s.position_max_m, 100.0, 2), "cm");
+    line(
+        "heading error",
+        or_dash(s.heading_rmse_rad, 1_f64.to_degrees(), 3),
+        "deg rmse",
+    );
+    line("alignment, paper's", or_dash(s.alignment_paper, 100.0, 2), "%");
+    line("alignment, ours", or_dash(s.alignment, 100.0, 2), "%");
+    line("crashes", s.crashes.to_string(), "");
+    line("scrapes", s.scrapes.to_string(), "");
+    line("spins", s.spins.to_string(), "");
+    line(
+        "load",
+        format!("{:.2}", s.load.cpu * 100.0),
+        "% of a core, per car",
+    );
+    line(
+        "update",
+        format!("{:.0} / {:.0}", s.load.update_us_p50, s.load.update_us_p99),
+        "us p50 / p99",
+    );
+    line(
+        "speed of the race",
+        format!("{:.1}", s.load.real_time_factor),
+        "times real time",
+    );
+}

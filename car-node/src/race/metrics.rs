@@ -1,0 +1,291 @@
+//! What is noted during a race, and what is said of it afterwards.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use maps::Pose;
+use serde::Serialize;
+use simulator::Track;
+use synpf::{Scan, TrackMap};
+
+use super::paper_alignment;
+use crate::evaluate::{PoseErrors, Summaries, mean, percentile};
+
+/// One finished lap.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LapRecord {
+    /// From line to line [s].
+    pub time_s: f64,
+    /// Mean distance of the *estimate* from the raceline, as the paper takes it [m].
+    pub line_error_m: f64,
+    /// Mean distance of the car from the raceline [m].
+    pub true_line_error_m: f64,
+    /// Mean scan alignment by the paper's definition, in [0, 1].
+    pub alignment_paper: f64,
+}
+
+/// Time that the localizer took on this machine.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct LoadSummary {
+    /// CPU seconds of the localizer per second of race.
+    pub cpu: f64,
+    /// Whole update, median [us].
+    pub update_us_p50: f64,
+    /// Whole update, 99 of 100 are faster [us].
+    pub update_us_p99: f64,
+    /// Race seconds per second that this race took, simulator and all.
+    pub real_time_factor: f64,
+}
+
+/// One car's race.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CarResult {
+    /// True when all laps were driven in time.
+    pub finished: bool,
+    /// The laps, in order.
+    pub laps: Vec<LapRecord>,
+    /// Times the car hit a wall and had to be put back.
+    pub crashes: u32,
+    /// Times it touched a wall and went on.
+    pub scrapes: u32,
+    /// Times it turned round.
+    pub spins: u32,
+    /// Estimate against truth, at the scans' stamps, the first 2 s left out; None when nothing was estimated.
+    pub pose_error: Option<Summaries>,
+    /// Mean scan alignment by the localizer's own definition (0.10 m), in [0, 1]; None where there is no localizer.
+    pub alignment: Option<f64>,
+    /// How long the race took [s].
+    pub race_s: f64,
+    /// Measured on this machine: differs from run to run.
+    pub load: LoadSummary,
+}
+
+/// Mean and standard deviation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct MeanSigma {
+    /// Mean.
+    pub mean: f64,
+    /// Standard deviation of the sample.
+    pub sigma: f64,
+}
+
+impl MeanSigma {
+    /// Of some values; None without any.
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let mean = mean(values)?;
+        let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
+        let freedom = (values.len() - 1).max(1) as f64;
+        Some(Self {
+            mean,
+            sigma: (squares / freedom).sqrt(),
+        })
+    }
+}
+
+/// All cars of all seeds together.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RaceSummary {
+    /// Cars that drove all their laps.
+    pub finished: usize,
+    /// Cars that started.
+    pub started: usize,
+    /// Laps driven.
+    pub laps: usize,
+    /// Lap time [s].
+    pub lap_time_s: Option<MeanSigma>,
+    /// Per lap: mean distance of the estimate from the raceline [m].
+    pub line_error_m: Option<MeanSigma>,
+    /// Per lap: mean distance of the car from the raceline [m].
+    pub true_line_error_m: Option<MeanSigma>,
+    /// Root mean square of the position's error [m], over cars of equal weight.
+    pub position_rmse_m: Option<f64>,
+    /// Largest error of the position [m].
+    pub position_max_m: Option<f64>,
+    /// Root mean square of the heading's error [rad].
+    pub heading_rmse_rad: Option<f64>,
+    /// Scan alignment by the paper's definition, in [0, 1].
+    pub alignment_paper: Option<f64>,
+    /// Scan alignment by ours, in [0, 1].
+    pub alignment: Option<f64>,
+    /// Crashes of all cars.
+    pub crashes: u32,
+    /// Scrapes of all cars.
+    pub scrapes: u32,
+    /// Spins of all cars.
+    pub spins: u32,
+    /// Means over the cars.
+    pub load: LoadSummary,
+}
+
+impl RaceSummary {
+    /// Sums up any number of cars.
+    pub fn of(cars: &[CarResult]) -> Self {
+        let laps: Vec<LapRecord> = cars.iter().flat_map(|car| car.laps.iter().copied()).collect();
+        let over_laps = |value: fn(&LapRecord) -> f64| laps.iter().map(value).collect::<Vec<_>>();
+        let errors: Vec<Summaries> = cars.iter().filter_map(|car| car.pose_error).collect();
+        let rms = |value: fn(&Summaries) -> f64| {
+            mean(&errors.iter().map(|e| value(e).powi(2)).collect::<Vec<_>>()).map(f64::sqrt)
+        };
+        let load = |value: fn(&LoadSummary) -> f64| {
+            mean(&cars.iter().map(|car| value(&car.load)).collect::<Vec<_>>()).unwrap_or_default()
+        };
+        let aligned: Vec<f64> = cars.iter().filter_map(|car| car.alignment).collect();
+        Self {
+            finished: cars.iter().filter(|car| car.finished).count(),
+            started: cars.len(),
+            laps: laps.len(),
+            lap_time_s: MeanSigma::of(&over_laps(|lap| lap.time_s)),
+            line_error_m: MeanSigma::of(&over_laps(|lap| lap.line_error_m)),
+            true_line_error_m: MeanSigma::of(&over_laps(|lap| lap.true_line_error_m)),
+            position_rmse_m: rms(|e| e.position_error_m.rmse),
+            position_max_m: errors.iter().map(|e| e.position_error_m.max).reduce(f64::max),
+            heading_rmse_rad: rms(|e| e.heading_error_rad.rmse),
+            alignment_paper: mean(&over_laps(|lap| lap.alignment_paper)),
+            alignment: mean(&aligned),
+            crashes: cars.iter().map(|car| car.crashes).sum(),
+            scrapes: cars.iter().map(|car| car.scrapes).sum(),
+            spins: cars.iter().map(|car| car.spins).sum(),
+            load: LoadSummary {
+                cpu: load(|l| l.cpu),
+                update_us_p50: load(|l| l.update_us_p50),
+                update_us_p99: load(|l| l.update_us_p99),
+                real_time_factor: load(|l| l.real_time_factor),
+            },
+        }
+    }
+}
+
+/// Takes notes of one car.
+pub(super) struct Recorder {
+    track: Arc<Track>,
+    map: Arc<TrackMap>,
+    finished: Vec<LapRecord>,
+    pub(super) crashes: u32,
+    pub(super) scrapes: u32,
+    pub(super) spins: u32,
+    pose_errors: PoseErrors,
+    /// Of the lap being driven: distances of estimate and car from the line, alignments.
+    line_errors: Vec<f64>,
+    true_line_errors: Vec<f64>,
+    alignments_paper: Vec<f64>,
+    alignments: Vec<f64>,
+    update_us: Vec<f64>,
+    busy: Duration,
+}
+
+impl Recorder {
+    pub(super) fn new(track: Arc<Track>, map: Arc<TrackMap>) -> Self {
+        Self {
+            track,
+            map,
+            finished: Vec::new(),
+            crashes: 0,
+            scrapes: 0,
+            spins: 0,
+            pose_errors: PoseErrors::default(),
+            line_errors: Vec::new(),
+            true_line_errors: Vec::new(),
+            alignments_paper: Vec::new(),
+            alignments: Vec::new(),
+            update_us: Vec::new(),
+            busy: Duration::ZERO,
+        }
+    }
+
+    pub(super) fn laps(&self) -> usize {
+        self.finished.len()
+    }
+
+    /// Notes the time that part of the localizer takes.
+    pub(super) fn timed<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        let begin = Instant::now();
+        let result = work();
+        self.busy += begin.elapsed();
+        result
+    }
+
+    /// Notes the time that a whole update takes.
+    pub(super) fn timed_update<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        let before = self.busy;
+        let result = self.timed(work);
+        self.update_us
+            .push(self.busy.saturating_sub(before).as_secs_f64() * 1e6);
+        result
+    }
+
+    /// The driver was given `estimate`, and the car was `true_d` [m] from the line.
+    pub(super) fn driven(&mut self, estimate: Pose, true_d: f64) {
+        let d = self.track.raceline.project([estimate.x, estimate.y]).d;
+        self.line_errors.push(d.abs());
+        self.true_line_errors.push(true_d.abs());
+    }
+
+    /// A scan was taken in; the estimate and the truth are those at its stamp.
+    pub(super) fn scanned(
+        &mut self,
+        scan: &Scan,
+        estimate: Pose,
+        twist: [f64; 2],
+        truth: Option<Pose>,
+        alignment: Option<f64>,
+        base_link_from_laser: Pose,
+    ) {
+        self.pose_errors.push(scan.stamp, estimate, truth);
+        self.alignments_paper.push(paper_alignment(
+            &self.map,
+            scan,
+            estimate,
+            twist,
+            base_link_from_laser,
+        ));
+        self.alignments.extend(alignment);
+    }
+
+    /// A lap is over.
+    pub(super) fn lap(&mut self, time: Duration) {
+        let mut taken =
+            |values: fn(&mut Self) -> &mut Vec<f64>| mean(&std::mem::take(values(self))).unwrap_or_default();
+        let lap = LapRecord {
+            time_s: time.as_secs_f64(),
+            line_error_m: taken(|r| &mut r.line_errors),
+            true_line_error_m: taken(|r| &mut r.true_line_errors),
+            alignment_paper: taken(|r| &mut r.alignments_paper),
+        };
+        self.finished.push(lap);
+    }
+
+    pub(super) fn result(mut self, race: Duration, elapsed: Duration, laps: u32) -> CarResult {
+        let finished = self.finished.len() >= laps as usize;
+        self.finished.truncate(laps as usize);
+        CarResult {
+            finished,
+            laps: self.finished,
+            crashes: self.crashes,
+            scrapes: self.scrapes,
+            spins: self.spins,
+            pose_error: self.pose_errors.summaries(),
+            alignment: mean(&self.alignments),
+            race_s: race.as_secs_f64(),
+            load: LoadSummary {
+                cpu: self.busy.as_secs_f64() / race.as_secs_f64(),
+                update_us_p50: percentile(&self.update_us, 0.5).unwrap_or_default(),
+                update_us_p99: percentile(&self.update_us, 0.99).unwrap_or_default(),
+                real_time_factor: race.as_secs_f64() / elapsed.as_secs_f64().max(1e-9),
+            },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sigma_is_that_of_a_sample() {
+        let of = MeanSigma::of(&[1.0, 2.0, 3.0]).expect("three values");
+        assert!((of.mean - 2.0).abs() < 1e-12 && (of.sigma - 1.0).abs() < 1e-12);
+        let one = MeanSigma::of(&[4.0]).expect("one value");
+        assert!(one.sigma.abs() < 1e-12);
+        assert!(MeanSigma::of(&[]).is_none());
+    }
+}

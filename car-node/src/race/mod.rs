@@ -1,0 +1,398 @@
+//! Races: simulated cars that drive on what a localizer tells them, lap after lap, and the measures of the paper.
+//!
+//! The loop is closed: a bad estimate steers the car off its line and costs time. No network, no clock: a race is as fast
+//! as the machine, and the same setup gives the same race (only [`LoadSummary`] is measured on this machine).
+
+mod alignment;
+mod metrics;
+mod paper;
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use maps::{Pose, wrap_angle};
+use serde::{Deserialize, Serialize};
+use simulator::{CarSetup, Estimate, Grip, Message, TICK, Track, World};
+use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
+
+pub use alignment::{PAPER_DISTANCE, paper_alignment};
+pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, RaceSummary};
+pub use paper::{PAPER_ROWS, PaperRow};
+
+use metrics::Recorder;
+
+/// What tells the driver where the car is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Guide {
+    /// The filter with a parameter set.
+    SynPf(Parameters),
+    /// Wheel odometry alone, from a perfect start.
+    Odometry,
+    /// The truth, as an upper bound.
+    Truth,
+}
+
+/// The two conditions of the paper's table I.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Quality {
+    /// Clean tyres: odometry is good.
+    Hq,
+    /// Taped tyres: they slip, and odometry lies.
+    Lq,
+}
+
+impl Quality {
+    /// The grip that makes the odometry so.
+    pub fn grip(self) -> Grip {
+        match self {
+            Self::Hq => Grip::HQ,
+            Self::Lq => Grip::LQ,
+        }
+    }
+}
+
+/// A race.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RaceSetup {
+    /// Laps for every car.
+    pub laps: u32,
+    /// Cars on the track, one behind the other.
+    pub cars: usize,
+    /// Grip.
+    pub quality: Quality,
+    /// What every car goes by.
+    pub guide: Guide,
+    /// Speed over the raceline's own.
+    pub speed_scale: f64,
+    /// Decides every random number.
+    pub seed: u64,
+}
+
+/// Gap between two cars at the start, along the line [m].
+const GRID_GAP: f64 = 3.0;
+
+/// Runs a race to its end: all laps driven, or four times the time they should take. `map` is the track's map, made ready
+/// once for all races.
+pub fn race(
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    setup: &RaceSetup,
+) -> Result<Vec<CarResult>, SetUpError> {
+    let mut car = CarSetup::default();
+    car.vehicle = car.vehicle.with_grip(setup.quality.grip());
+    car.driver.speed_scale = setup.speed_scale;
+    let setups: Vec<CarSetup> = (0..setup.cars)
+        .map(|index| CarSetup {
+            start: car.start - GRID_GAP * index as f64,
+            ..car
+        })
+        .collect();
+    let mut world = World::new(Arc::clone(track), &setups, setup.seed);
+    let mut crews = (0..setup.cars)
+        .map(|index| Crew::new(&world, index, map, setup, &car))
+        .collect::<Result<Vec<_>, _>>()?;
+
+    let begin = Instant::now();
+    let limit =
+        Duration::from_secs_f64(10.0 + 4.0 * f64::from(setup.laps) * track.lap_time() / setup.speed_scale);
+    let done = |crews: &[Crew]| {
+        crews
+            .iter()
+            .all(|crew| crew.recorder.laps() >= setup.laps as usize)
+    };
+    while !done(&crews) && world.now() < limit {
+        for output in world.step() {
+            let index = output.car;
+            if let Some(estimate) = crews[index].take_in(&world, index, &output.message) {
+                world.guide(index, estimate);
+            }
+        }
+    }
+    let elapsed = begin.elapsed();
+    Ok(crews
+        .into_iter()
+        .map(|crew| crew.recorder.result(world.now(), elapsed, setup.laps))
+        .collect())
+}
+
+/// One car's localizer and everything that is noted of it.
+struct Crew {
+    guide: RunningGuide,
+    recorder: Recorder,
+    /// True poses of the last half second, for estimates that are about the past.
+    truths: VecDeque<(Stamp, Pose)>,
+    base_link_from_laser: Pose,
+    latest: Option<simulator::Odometry>,
+}
+
+enum RunningGuide {
+    SynPf(Box<Localizer>),
+    /// `map_from_odom`, once it is known.
+    Odometry(Option<Pose>, Pose),
+    Truth,
+}
+
+impl Crew {
+    fn new(
+        world: &World,
+        index: usize,
+        map: &Arc<TrackMap>,
+        setup: &RaceSetup,
+        car: &CarSetup,
+    ) -> Result<Self, SetUpError> {
+        let start = world.truth(index).pose;
+        let base_link_from_laser = car.lidar.base_link_from_laser;
+        let guide = match &setup.guide {
+            Guide::SynPf(parameters) => {
+                let seed = setup.seed.wrapping_add(index as u64);
+                let parameters = parameters.clone();
+                let mut localizer = Localizer::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
+                localizer.initialize(start)?;
+                RunningGuide::SynPf(Box::new(localizer))
+            }
+            Guide::Odometry => RunningGuide::Odometry(None, start),
+            Guide::Truth => RunningGuide::Truth,
+        };
+        Ok(Self {
+            guide,
+            recorder: Recorder::new(Arc::clone(world.track()), Arc::clone(map)),
+            truths: VecDeque::new(),
+            base_link_from_laser,
+            latest: None,
+        })
+    }
+
+    /// Passes a message on to the localizer. Returns an estimate when there is a new one.
+    fn take_in(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
+        match message {
+            Message::Odometry(odometry) => {
+                self.latest = Some(*odometry);
+                let pose = self.on_odometry(odometry, world, index)?;
+                self.recorder.driven(pose, world.truth(index).track.d);
+                Some(Estimate {
+                    time: odometry.stamp,
+                    pose,
+                    speed: odometry.speed,
+                    yaw_rate: odometry.yaw_rate,
+                })
+            }
+            Message::Gyro(gyro) => {
+                if let RunningGuide::SynPf(localizer) = &mut self.guide {
+                    let reading = YawRate {
+                        stamp: stamp(gyro.stamp),
+                        rate: gyro.yaw_rate,
+                    };
+                    self.recorder.timed(|| localizer.on_yaw_rate(&reading)).ok();
+                }
+                None
+            }
+            Message::Scan(scan) => {
+                let pose = self.on_scan(scan)?;
+                let latest = self.latest?;
+                Some(Estimate {
+                    time: latest.stamp,
+                    pose,
+                    speed: latest.speed,
+                    yaw_rate: latest.yaw_rate,
+                })
+            }
+            Message::Truth(truth) => {
+                self.truths.push_back((stamp(truth.stamp), truth.pose));
+                if self.truths.len() > 50 {
+                    self.truths.pop_front();
+                }
+                None
+            }
+            Message::Placed(pose) => {
+                // The crew tells the localizer where the marshals put the car.
+                match &mut self.guide {
+                    RunningGuide::SynPf(localizer) => {
+                        localizer.initialize(*pose).ok();
+                    }
+                    RunningGuide::Odometry(map_from_odom, start) => (*map_from_odom, *start) = (None, *pose),
+                    RunningGuide::Truth => {}
+                }
+                None
+            }
+            Message::Lap(lap) => {
+                self.recorder.lap(lap.time);
+                None
+            }
+            Message::Crash(_) => {
+                self.recorder.crashes += 1;
+                None
+            }
+            Message::Scrape(_) => {
+                self.recorder.scrapes += 1;
+                None
+            }
+            Message::Spin => {
+                self.recorder.spins += 1;
+                None
+            }
+        }
+    }
+
+    /// `map_from_base_link` at the odometry's stamp.
+    fn on_odometry(&mut self, odometry: &simulator::Odometry, world: &World, index: usize) -> Option<Pose> {
+        match &mut self.guide {
+            RunningGuide::SynPf(localizer) => {
+                let message = Odometry {
+                    stamp: stamp(odometry.stamp),
+                    pose: odometry.pose,
+                    twist: Twist {
+                        linear_x: odometry.speed,
+                        linear_y: 0.0,
+                        angular: odometry.yaw_rate,
+                    },
+                };
+                self.recorder.timed(|| {
+                    localizer.on_odometry(&message).ok();
+                    localizer.predict(message.stamp)
+                })
+            }
+            RunningGuide::Odometry(map_from_odom, start) => {
+                let map_from_odom = map_from_odom.get_or_insert(*start * odometry.pose.inverse());
+                Some(*map_from_odom * odometry.pose)
+            }
+            RunningGuide::Truth => Some(world.truth(index).pose),
+        }
+    }
+
+    /// Lets the localizer take in a scan and notes how good it is. Returns the pose now, if the scan changed it.
+    fn on_scan(&mut self, scan: &simulator::Scan) -> Option<Pose> {
+        let message = Scan {
+            stamp: stamp(scan.stamp),
+            angle_min: scan.angle_min,
+            angle_increment: scan.angle_increment,
+            time_increment: scan.time_increment,
+            range_min: scan.range_min,
+            range_max: scan.range_max,
+            ranges: scan.ranges.clone(),
+        };
+        let truth = self.truth_at(message.stamp);
+        let RunningGuide::SynPf(localizer) = &mut self.guide else {
+            // What has no opinion of scans is judged by where it says the car is, or the truth.
+            let pose = match &self.guide {
+                RunningGuide::Odometry(map_from_odom, _) => {
+                    let latest = self.latest?;
+                    let back = latest.stamp.as_secs_f64() - scan.stamp.as_secs_f64();
+                    let moved = [latest.speed, 0.0, latest.yaw_rate].map(|rate| -rate * back);
+                    (*map_from_odom)? * latest.pose * Pose::exp(moved)
+                }
+                _ => truth?,
+            };
+            let twist = self
+                .latest
+                .map_or([0.0; 2], |latest| [latest.speed, latest.yaw_rate]);
+            self.recorder
+                .scanned(&message, pose, twist, truth, None, self.base_link_from_laser);
+            return None;
+        };
+        let update = self.recorder.timed_update(|| localizer.on_scan(&message)).ok()?;
+        let twist = [update.twist.linear_x, update.twist.angular];
+        self.recorder.scanned(
+            &message,
+            update.pose,
+            twist,
+            truth,
+            Some(update.alignment),
+            self.base_link_from_laser,
+        );
+        localizer.predict(stamp(self.latest?.stamp))
+    }
+
+    /// The true pose at `time`, between the two noted next to it.
+    fn truth_at(&self, time: Stamp) -> Option<Pose> {
+        let after = self.truths.partition_point(|(stamp, _)| *stamp < time);
+        let (t1, to) = *self.truths.get(after)?;
+        let (t0, from) = *self.truths.get(after.checked_sub(1)?)?;
+        let share = time.since(t0) / t1.since(t0);
+        Some(Pose::new(
+            from.x + share * (to.x - from.x),
+            from.y + share * (to.y - from.y),
+            from.heading + share * wrap_angle(to.heading - from.heading),
+        ))
+    }
+}
+
+/// The simulator counts from the start; the localizer only compares.
+fn stamp(time: Duration) -> Stamp {
+    Stamp(time.as_nanos() as i64)
+}
+
+/// Race time that one tick takes; real time is kept by a race that takes less for it.
+pub const RACE_TICK: Duration = TICK;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn club() -> (Arc<Track>, Arc<TrackMap>) {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../maps/tracks/club");
+        let track = Track::load(folder).expect("a bundled track");
+        let map = TrackMap::new(track.grid.clone()).expect("a map with free space");
+        (Arc::new(track), Arc::new(map))
+    }
+
+    fn setup(guide: Guide, laps: u32, cars: usize) -> RaceSetup {
+        RaceSetup {
+            laps,
+            cars,
+            quality: Quality::Hq,
+            guide,
+            speed_scale: 1.0,
+            seed: 5,
+        }
+    }
+
+    #[test]
+    fn on_the_truth_a_lap_of_club_takes_what_the_paper_s_took() {
+        let (track, map) = club();
+        let results = race(&track, &map, &setup(Guide::Truth, 2, 1)).expect("a race");
+        let [car] = &results[..] else { panic!("one car") };
+        assert!(car.finished && car.crashes == 0);
+        for lap in &car.laps {
+            assert!((9.0..9.6).contains(&lap.time_s), "{} s", lap.time_s);
+        }
+        // The truth is never wrong, but for how it is interpolated.
+        let errors = car.pose_error.expect("errors");
+        assert!(errors.position_error_m.max < 0.005);
+    }
+
+    #[test]
+    fn odometry_alone_does_not_last_ten_laps() {
+        let (track, map) = club();
+        let setup = RaceSetup {
+            quality: Quality::Lq,
+            ..setup(Guide::Odometry, 10, 1)
+        };
+        let results = race(&track, &map, &setup).expect("a race");
+        assert!(results[0].crashes > 0);
+    }
+
+    #[test]
+    fn the_same_seed_is_the_same_race() {
+        let (track, map) = club();
+        let parameters = Parameters::named("hq").expect("ships");
+        let run = |seed| {
+            let setup = RaceSetup {
+                seed,
+                ..setup(Guide::SynPf(parameters.clone()), 1, 2)
+            };
+            let results = race(&track, &map, &setup).expect("a race");
+            let without_load: Vec<_> = results
+                .into_iter()
+                .map(|car| CarResult {
+                    load: LoadSummary::default(),
+                    ..car
+                })
+                .collect();
+            serde_json::to_string(&without_load).expect("numbers")
+        };
+        assert_eq!(run(1), run(1));
+        assert_ne!(run(1), run(2));
+    }
+}

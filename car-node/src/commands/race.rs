@@ -54,7 +54,10 @@ fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, Guide)> {
     Ok(match arguments.localizer {
         cli::Guide::Synpf => {
             let set = load_set(&arguments.params)?;
-            (format!("synpf {}", set.name), Guide::SynPf(set.parameters))
+            (
+                format!("synpf {}", set.name),
+                Guide::SynPf(Box::new(set.parameters)),
+            )
         }
         cli::Guide::SynpfBaseline => shipped("synpf-baseline")?,
         cli::Guide::Odometry => ("odometry".into(), Guide::Odometry),
@@ -69,7 +72,7 @@ fn shipped(name: &str) -> anyhow::Result<(String, Guide)> {
     } else {
         format!("synpf {name}")
     };
-    Ok((title, Guide::SynPf(parameters)))
+    Ok((title, Guide::SynPf(Box::new(parameters))))
 }
 
 /// One race for each seed, side by side on the machine's cores.

@@ -26,7 +26,7 @@ use metrics::Recorder;
 #[derive(Debug, Clone, PartialEq)]
 pub enum Guide {
     /// The filter with a parameter set.
-    SynPf(Parameters),
+    SynPf(Box<Parameters>),
     /// Wheel odometry alone, from a perfect start.
     Odometry,
     /// The truth, as an upper bound.
@@ -147,7 +147,9 @@ impl Crew {
         let guide = match &setup.guide {
             Guide::SynPf(parameters) => {
                 let seed = setup.seed.wrapping_add(index as u64);
-                let parameters = parameters.clone();
+                let parameters = Parameters::clone(parameters);
+                // A car's tables are ready before it starts.
+                map.prepare(Some(start), &parameters);
                 let mut localizer = Localizer::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
                 localizer.initialize(start)?;
                 RunningGuide::SynPf(Box::new(localizer))
@@ -380,7 +382,7 @@ mod tests {
         let run = |seed| {
             let setup = RaceSetup {
                 seed,
-                ..setup(Guide::SynPf(parameters.clone()), 1, 2)
+                ..setup(Guide::SynPf(Box::new(parameters.clone())), 1, 2)
             };
             let results = race(&track, &map, &setup).expect("a race");
             let without_load: Vec<_> = results

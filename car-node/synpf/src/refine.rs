@@ -35,11 +35,11 @@ impl Default for RefinementParameters {
     fn default() -> Self {
         Self {
             refine: true,
-            refine_beams: 360,
+            refine_beams: 540,
             refine_iterations: 8,
             refine_sigma: 0.03,
-            refine_reach: 0.08,
-            refine_correlation: 6.0,
+            refine_reach: 0.06,
+            refine_correlation: 4.0,
             refine_feedback: 0.1,
         }
     }

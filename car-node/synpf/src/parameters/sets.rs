@@ -24,9 +24,10 @@ fn lq() -> Parameters {
     let hq = Parameters::default();
     Parameters {
         motion: MotionParameters {
-            odometry_speed_error: 0.20,
-            odometry_side_error: 0.06,
-            odometry_yaw_error: 0.20,
+            odometry_speed_error: 0.4,
+            odometry_side_error: 0.25,
+            odometry_yaw_error: 1.0,
+            diffusion_heading: 0.3,
             ..hq.motion
         },
         ..hq

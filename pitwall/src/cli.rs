@@ -30,6 +30,14 @@ pub(crate) struct Page {
     /// The folder that recordings started from the page go to.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     pub(crate) recordings: PathBuf,
+    /// Write what the Rerun viewer shows into this file too.
+    #[cfg(feature = "rerun")]
+    #[arg(long, value_name = "FILE.rrd")]
+    pub(crate) rerun_save: Option<PathBuf>,
+    /// Send it to a Rerun viewer that listens there.
+    #[cfg(feature = "rerun")]
+    #[arg(long, value_name = "URL", num_args = 0..=1, default_missing_value = "rerun+http://127.0.0.1:9876/proxy")]
+    pub(crate) rerun_connect: Option<String>,
 }
 
 const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use crossbeam_channel::{Receiver, Sender, TrySendError};
 use protocol::CarName;
 use tokio::task::JoinHandle;
 
@@ -23,6 +24,7 @@ pub struct Hub {
 struct Shared {
     fleet: Mutex<Fleet>,
     recorder: Mutex<Option<Recorder>>,
+    taps: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
 }
 
 impl Shared {
@@ -36,9 +38,12 @@ impl Shared {
 
     fn take(&self, event: FleetEvent) {
         self.fleet().apply(&event);
+        let event = Arc::new(event);
         if let Some(recorder) = &*self.recorder() {
-            recorder.take(&Arc::new(event));
+            recorder.take(&event);
         }
+        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
+        taps.retain(|tap| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))));
     }
 }
 
@@ -73,6 +78,21 @@ impl Hub {
     /// What is known. Hold it briefly: what comes in meanwhile waits.
     pub fn fleet(&self) -> MutexGuard<'_, Fleet> {
         self.shared.fleet()
+    }
+
+    /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
+    pub fn tap(&self) -> Receiver<Arc<FleetEvent>> {
+        const WAITING: usize = 20_000;
+        let (tap, events) = crossbeam_channel::bounded(WAITING);
+        for event in self.known() {
+            drop(tap.try_send(Arc::new(event)));
+        }
+        self.shared
+            .taps
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(tap);
+        events
     }
 
     /// Waits until a car is there; false when it is not within `patience`.

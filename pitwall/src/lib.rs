@@ -16,6 +16,8 @@ mod hub;
 mod link;
 mod log;
 mod recording;
+#[cfg(feature = "rerun")]
+mod rerun_view;
 mod stream;
 mod wall;
 mod web;
@@ -31,6 +33,8 @@ pub use log::{Log, LogEntry};
 pub use recording::{
     Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events, recover,
 };
+#[cfg(feature = "rerun")]
+pub use rerun_view::{RerunError, RerunOutlet, RerunView};
 pub use stream::{Stream, StreamView};
 pub use wall::{PitWall, WallError, WallOptions};
 pub use web::{Page, PageOptions};

@@ -83,7 +83,10 @@ pub(super) async fn check(State(guard): State<Arc<Guard>>, request: Request, nex
         Err(why) => return (StatusCode::FORBIDDEN, why).into_response(),
     };
     let headers = response.headers_mut();
-    headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
+    // The viewer in the pane has a policy of its own.
+    headers
+        .entry(header::CONTENT_SECURITY_POLICY)
+        .or_insert(HeaderValue::from_static(POLICY));
     headers.insert(
         header::X_CONTENT_TYPE_OPTIONS,
         HeaderValue::from_static("nosniff"),

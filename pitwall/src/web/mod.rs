@@ -8,12 +8,15 @@
 //! POST /command        {car, operator, expected_revision, id, action}: waits for the car and says what became of it
 //! POST /record         {"on": true|false}
 //! POST /mark           {car, operator, text}
+//! POST /rerun          starts the Rerun viewer's data and says where the viewer is; it is served under /rerun/
 //! ```
 //!
 //! Only pages of our own origin are served, and nothing on the page comes from anywhere else: the
 //! `Content-Security-Policy` says so to the browser. On any but a loopback address a token is asked for.
 mod api;
 mod guard;
+#[cfg(feature = "rerun")]
+mod rerun;
 mod snapshot;
 
 use std::net::SocketAddr;
@@ -62,6 +65,8 @@ struct App {
     hub: Arc<Hub>,
     recordings: Arc<PathBuf>,
     stopping: watch::Receiver<bool>,
+    #[cfg(feature = "rerun")]
+    pane: Arc<tokio::sync::Mutex<Option<rerun::Pane>>>,
 }
 
 impl App {
@@ -83,6 +88,8 @@ impl Page {
             hub,
             recordings: Arc::new(options.recordings),
             stopping,
+            #[cfg(feature = "rerun")]
+            pane: Arc::default(),
         };
         let router = files()
             .route("/ws", get(snapshot::socket))
@@ -90,7 +97,12 @@ impl Page {
             .route("/map/{car}", get(api::map))
             .route("/command", post(api::command))
             .route("/record", post(api::record))
-            .route("/mark", post(api::mark))
+            .route("/mark", post(api::mark));
+        #[cfg(feature = "rerun")]
+        let router = router
+            .route("/rerun", post(rerun::open))
+            .route("/rerun/{file}", get(rerun::file));
+        let router = router
             .layer(axum::middleware::from_fn_with_state(
                 Arc::new(guard),
                 guard::check,

@@ -122,6 +122,24 @@ $("marker").addEventListener("close", () => {
   if ($("marker").returnValue === "ok" && text) post("/mark", { car: selected, operator: operator.value, text });
 });
 
+/// Shows the Rerun viewer in place of the track, or takes it away again with all that it uses.
+async function rerun() {
+  const viewer = $("viewer");
+  const on = viewer.hidden;
+  if (on) {
+    const { ok, body } = await post("/rerun", {});
+    if (!ok) {
+      $("hint").textContent = body || "this program was built without Rerun";
+      return;
+    }
+    viewer.src = body.url;
+  } else {
+    viewer.src = "about:blank";
+  }
+  viewer.hidden = !on;
+  $("rerun").setAttribute("aria-pressed", String(on));
+}
+
 function theme(name) {
   document.documentElement.dataset.theme = name;
   $("theme").textContent = name === "dark" ? "light" : "dark";
@@ -154,10 +172,11 @@ $("follow").addEventListener("click", follow);
 $("place").addEventListener("click", () => place(!track.placing));
 $("search").addEventListener("click", search);
 $("mark").addEventListener("click", mark);
+$("rerun").addEventListener("click", rerun);
 $("acknowledge").addEventListener("click", () => log.acknowledge());
 
 const KEYS = {
-  r: record, t: otherTheme, "?": () => $("help").showModal(), 0: fit, f: follow, g: search, m: mark,
+  r: record, t: otherTheme, "?": () => $("help").showModal(), 0: fit, f: follow, g: search, m: mark, v: rerun,
   i: () => place(!track.placing), a: () => log.acknowledge(),
   "+": () => track.zoom(1.3), "=": () => track.zoom(1.3), "-": () => track.zoom(1 / 1.3),
   c: () => selected && act(selected, { params: "confirm" }),

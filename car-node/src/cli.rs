@@ -64,8 +64,8 @@ pub(crate) struct Run {
     /// ROS 2 bag (MCAP) to play.
     #[arg(long, value_name = "FILE.mcap", required_if_eq("source", "bag"))]
     pub(crate) bag: Option<PathBuf>,
-    /// Map: a map_server YAML file. For the simulator, a track's folder or its map.
-    #[arg(long, value_name = "MAP.yaml")]
+    /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
+    #[arg(long, value_name = "MAP.yaml|TRACK")]
     pub(crate) map: PathBuf,
     /// Raceline to measure progress along [default: raceline.csv beside the map, if there].
     #[arg(long, value_name = "FILE")]

@@ -15,10 +15,12 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, bounded, select};
+use maps::Pose;
 use protocol::{
-    Action, Answer, Command, CommandId, EventKind, Outcome, ParamsAction, RatesAction, RelocalizeAction,
-    Reply, Stamps, Topic, decode, encode,
+    Action, Answer, Candidate, Command, CommandId, EventKind, Outcome, ParamsAction, RatesAction,
+    RelocalizeAction, Reply, Stamps, Topic, decode, encode,
 };
+use synpf::{TrackMap, Tuning};
 use zenoh::Wait;
 use zenoh::query::Query;
 
@@ -38,6 +40,10 @@ const PARAMS_PERIOD: Duration = Duration::from_secs(1);
 const TICK: Duration = Duration::from_millis(50);
 /// After a switch by itself, the car keeps that set at least this long.
 const AUTO_HOLD: Duration = Duration::from_secs(10);
+/// A search answers with what it has after this long.
+const SEARCH_PATIENCE: Duration = Duration::from_secs(1);
+/// Candidates that an operator can choose from.
+const MOST_CANDIDATES: usize = 10;
 /// Who switches when the car does it by itself.
 const AUTO: &str = "auto";
 
@@ -64,6 +70,8 @@ pub struct Desk {
     pub clock: SensorClock,
     /// This run of the node.
     pub session_number: u64,
+    /// The map, to make sets ready for it.
+    pub track_map: Arc<TrackMap>,
     /// The answer to `map`, encoded.
     pub map: Vec<u8>,
     /// The answer to `info`, encoded.
@@ -212,7 +220,7 @@ impl Loop {
                 self.tell_params();
                 done(None, Reply::Nothing)
             }
-            Ok(Decision::Change(plan)) => match self.change(plan, &command.operator, Some(command.id)) {
+            Ok(Decision::Change(plan)) => match self.change(*plan, &command.operator, Some(command.id)) {
                 Ok(update) => done(Some(update), Reply::Nothing),
                 Err(faults) => Outcome::Refused { faults },
             },
@@ -259,16 +267,29 @@ impl Loop {
         Ok(update)
     }
 
+    /// Has the filter swap its set. What takes time, the tables of the set, is made ready here.
     fn swap(&self, plan: &Plan) -> Result<u64, Vec<String>> {
+        let map = &self.desk.track_map;
+        map.prepare(self.believed(), &plan.parameters);
+        let tuning = Tuning::new(plan.parameters.clone(), map)
+            .map_err(|faults| faults.iter().map(ToString::to_string).collect::<Vec<_>>())?;
         let (answer, answered) = bounded(1);
         let order = Order::SetParameters {
             name: plan.name.clone(),
-            parameters: Box::new(plan.parameters.clone()),
+            tuning: Box::new(tuning),
             answer,
         };
-        self.order(order, &answered)
-            .map_err(|fault| vec![fault])?
-            .map_err(|faults| faults.iter().map(ToString::to_string).collect())
+        self.order(order, &answered).map_err(|fault| vec![fault])
+    }
+
+    /// Where the car believes to be.
+    fn believed(&self) -> Option<Pose> {
+        self.desk
+            .shared
+            .belief
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .map(|belief| belief.pose)
     }
 
     /// Gives the filter an order and waits for its answer.
@@ -282,7 +303,7 @@ impl Loop {
             .map_err(|_| format!("the filter did not answer within {} s", PATIENCE.as_secs()))
     }
 
-    fn initialize(&mut self, command: &Command, pose: maps::Pose) -> Outcome {
+    fn initialize(&mut self, command: &Command, pose: Pose) -> Outcome {
         let (answer, answered) = bounded(1);
         match self
             .order(Order::Initialize { pose, answer }, &answered)
@@ -304,15 +325,49 @@ impl Loop {
                 match self.order(Order::Relocalize { answer }, &answered) {
                     Ok(update) => {
                         self.event(EventKind::SearchStarted, Some(command));
-                        done(Some(update), Reply::Nothing)
+                        done(Some(update), Reply::Candidates(self.candidates()))
                     }
                     Err(fault) => refused(fault),
                 }
             }
             RelocalizeAction::Pick { candidate } => {
-                refused(format!("no search has left a candidate {candidate}"))
+                let (answer, answered) = bounded(1);
+                let order = Order::Pick {
+                    number: candidate as usize,
+                    answer,
+                };
+                match self.order(order, &answered).and_then(|picked| picked) {
+                    Ok((update, pose)) => {
+                        let pose = wire::pose2(pose);
+                        self.event(EventKind::Relocalized { pose }, Some(command));
+                        done(Some(update), Reply::Nothing)
+                    }
+                    Err(fault) => refused(fault),
+                }
             }
         }
+    }
+
+    /// What the search finds with the next scans: asked for until there is something, for a second at most. Empty
+    /// when there is nothing by then, or when one candidate won at once.
+    fn candidates(&self) -> Vec<Candidate> {
+        let until = Instant::now() + SEARCH_PATIENCE;
+        while Instant::now() < until {
+            let (answer, answered) = bounded(1);
+            match self.order(Order::Candidates { answer }, &answered) {
+                Ok(found) if !found.is_empty() => {
+                    return found
+                        .iter()
+                        .take(MOST_CANDIDATES)
+                        .enumerate()
+                        .map(|(index, hypothesis)| wire::candidate(index, hypothesis))
+                        .collect();
+                }
+                Ok(_) => thread::sleep(TICK),
+                Err(_) => break,
+            }
+        }
+        Vec::new()
     }
 
     fn about_rates(&mut self, command: &Command, action: &RatesAction) -> Outcome {
@@ -391,7 +446,7 @@ impl Loop {
             revert_after_ms: None,
         };
         if let Ok(Decision::Change(plan)) = self.desk.keeper.plan(&action, None)
-            && let Err(faults) = self.change(plan, AUTO, None)
+            && let Err(faults) = self.change(*plan, AUTO, None)
         {
             let text = format!("cannot switch: {}", faults.join("; "));
             self.event_by(EventKind::Error { text }, Some(AUTO), None);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
 use protocol::{CommandId, EventKind, Rates};
-use synpf::{Localizer, Odometry, ParameterFault, Parameters, Scan, Stamp, Update, WeightedPose};
+use synpf::{Hypothesis, Localizer, Odometry, Scan, Stamp, Tuning, Update, WeightedPose};
 
 use crate::bag::SensorEvent;
 use crate::clock::SensorClock;
@@ -27,10 +27,10 @@ pub enum Order {
     SetParameters {
         /// The set's name, for proposals and laps.
         name: String,
-        /// The set.
-        parameters: Box<Parameters>,
+        /// The set, made ready.
+        tuning: Box<Tuning>,
         /// Where the answer goes.
-        answer: Sender<Result<u64, Vec<ParameterFault>>>,
+        answer: Sender<u64>,
     },
     /// Start again from a pose.
     Initialize {
@@ -43,6 +43,18 @@ pub enum Order {
     Relocalize {
         /// Where the answer goes.
         answer: Sender<u64>,
+    },
+    /// Tell what a search has found so far, the best first.
+    Candidates {
+        /// Where the answer goes.
+        answer: Sender<Vec<Hypothesis>>,
+    },
+    /// Follow one of the candidates that were last told, counted from 1.
+    Pick {
+        /// Which.
+        number: usize,
+        /// Where the answer goes: the update, and where the car is taken to be.
+        answer: Sender<Result<(u64, Pose), String>>,
     },
 }
 
@@ -173,6 +185,9 @@ struct Loop {
     advisor: Advisor,
     last_update: Option<Update>,
     last_state: State,
+    last_odometry: Option<Pose>,
+    /// What was last told of a search, and odometry's pose then: the car drives on while somebody chooses.
+    candidates: (Vec<Hypothesis>, Option<Pose>),
 }
 
 /// Silence is looked at this often.
@@ -194,6 +209,8 @@ pub fn start(
             advisor: Advisor::default(),
             last_update: None,
             last_state,
+            last_odometry: None,
+            candidates: (Vec::new(), None),
         }
         .run(feed, &orders);
     })
@@ -248,26 +265,25 @@ impl Loop {
         let now = self.now();
         // An answer that nobody waits for any more is nobody's loss.
         match order {
-            Order::SetParameters {
-                name,
-                parameters,
-                answer,
-            } => {
-                let result = self.filter.localizer.set_parameters(*parameters);
-                if result.is_ok() {
-                    self.filter.set = name;
-                }
-                answer.send(result.map(|()| next)).ok();
+            Order::SetParameters { name, tuning, answer } => {
+                self.filter.localizer.tune(*tuning);
+                self.filter.set = name;
+                answer.send(next).ok();
             }
             Order::Initialize { pose, answer } => {
-                let result = self.filter.localizer.initialize(pose);
-                if result.is_ok() {
-                    self.filter.monitor.on_new_pose(now);
-                    self.laps.on_new_pose();
-                }
-                answer
-                    .send(result.map(|()| next).map_err(|error| error.to_string()))
-                    .ok();
+                answer.send(self.initialize(pose).map(|()| next)).ok();
+            }
+            Order::Candidates { answer } => {
+                let found = self.filter.localizer.hypotheses();
+                self.candidates = (found.clone(), self.last_odometry);
+                answer.send(found).ok();
+            }
+            Order::Pick { number, answer } => {
+                let picked = self.picked(number).and_then(|pose| {
+                    self.initialize(pose)?;
+                    Ok((next, pose))
+                });
+                answer.send(picked).ok();
             }
             Order::Relocalize { answer } => {
                 self.filter.localizer.relocalize();
@@ -276,6 +292,33 @@ impl Loop {
                 answer.send(next).ok();
             }
         }
+    }
+
+    fn initialize(&mut self, pose: Pose) -> Result<(), String> {
+        self.filter
+            .localizer
+            .initialize(pose)
+            .map_err(|error| error.to_string())?;
+        let now = self.now();
+        self.filter.monitor.on_new_pose(now);
+        self.laps.on_new_pose();
+        Ok(())
+    }
+
+    /// Where a candidate is by now.
+    fn picked(&self, number: usize) -> Result<Pose, String> {
+        let (candidates, odometry_then) = &self.candidates;
+        let candidate = number
+            .checked_sub(1)
+            .and_then(|index| candidates.get(index))
+            .ok_or_else(|| match candidates.len() {
+                0 => "no search has found a candidate yet".to_owned(),
+                count => format!("candidate {number} of {count}"),
+            })?;
+        Ok(match (self.last_odometry, odometry_then) {
+            (Some(now), Some(then)) => candidate.pose * now.since(*then),
+            _ => candidate.pose,
+        })
     }
 
     fn take_in(&mut self, feed: Feed, queued: usize) {
@@ -309,9 +352,7 @@ impl Loop {
     }
 
     fn placed(&mut self, pose: Pose) {
-        if self.filter.localizer.initialize(pose).is_ok() {
-            self.filter.monitor.on_new_pose(self.now());
-            self.laps.on_new_pose();
+        if self.initialize(pose).is_ok() {
             self.event(EventKind::PoseInitialized {
                 pose: wire::pose2(pose),
             });
@@ -321,6 +362,7 @@ impl Loop {
     fn on_odometry(&mut self, odometry: Odometry, now: Stamp) -> Result<(), synpf::Dropped> {
         self.filter.localizer.on_odometry(&odometry)?;
         self.filter.monitor.on_odometry(now);
+        self.last_odometry = Some(odometry.pose);
         if self.rates().recorded {
             self.filter.shared.outbox.record(Record::Odometry(odometry));
         }

@@ -74,7 +74,7 @@ pub struct Plan {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Decision {
     /// Swap the set, then [`Keeper::commit`].
-    Change(Plan),
+    Change(Box<Plan>),
     /// Keep what is in force; nobody falls back any more.
     Confirmed,
     /// A set is gone.
@@ -191,12 +191,12 @@ impl Keeper {
                 revert_after_ms,
             } => {
                 let parameters = self.find(name).ok_or_else(|| fault(self.no_such_set(name)))?;
-                Ok(Decision::Change(Plan {
+                Ok(Decision::Change(Box::new(Plan {
                     name: name.clone(),
                     parameters,
                     store: false,
                     revert_after: trial(*revert_after_ms).map_err(fault)?,
-                }))
+                })))
             }
             ParamsAction::Put { set, revert_after_ms } => self.plan_put(set, *revert_after_ms),
             ParamsAction::Confirm => {
@@ -211,12 +211,12 @@ impl Keeper {
                     .previous
                     .clone()
                     .ok_or_else(|| fault("no set was in force before this one".into()))?;
-                Ok(Decision::Change(Plan {
+                Ok(Decision::Change(Box::new(Plan {
                     name,
                     parameters,
                     store: false,
                     revert_after: None,
-                }))
+                })))
             }
             ParamsAction::Delete { name } => {
                 if Parameters::NAMES.contains(&name.as_str()) {
@@ -257,12 +257,12 @@ impl Keeper {
             .iter()
             .map(|(key, value)| (key.clone(), wire::json(value)));
         match sets::with_values(&self.in_force.parameters, given) {
-            Ok(parameters) if faults.is_empty() => Ok(Decision::Change(Plan {
+            Ok(parameters) if faults.is_empty() => Ok(Decision::Change(Box::new(Plan {
                 name: set.name.clone(),
                 parameters,
                 store: true,
                 revert_after,
-            })),
+            }))),
             Ok(_) => Err(Refusal::Faults(faults)),
             Err(more) => {
                 faults.extend(more.iter().map(ToString::to_string));
@@ -398,6 +398,10 @@ mod tests {
         Keeper::new(Memory::default(), "hq".into(), hq, NOW)
     }
 
+    fn particles_of(keeper: &Keeper) -> serde_json::Value {
+        sets::values(&keeper.in_force().parameters)["max_particles"].clone()
+    }
+
     fn select(name: &str, revert_after_ms: Option<u32>) -> ParamsAction {
         ParamsAction::Select {
             name: name.into(),
@@ -424,7 +428,7 @@ mod tests {
                 if plan.store {
                     keeper.store(&plan, "anna");
                 }
-                keeper.commit(plan, "anna", now, 7);
+                keeper.commit(*plan, "anna", now, 7);
             }
             other => panic!("no change: {other:?}"),
         }
@@ -511,7 +515,7 @@ mod tests {
             &put("mine", &[("max_particles", Value::Int(1500))]),
             NOW,
         );
-        assert_eq!(keeper.in_force().parameters.max_particles, 1500);
+        assert_eq!(particles_of(&keeper), 1500);
         assert!(keeper.params().available.contains(&"mine".to_owned()));
 
         let text = serde_json::to_string(keeper.memory()).expect("writes");
@@ -519,7 +523,7 @@ mod tests {
         let mut again = Keeper::new(memory, "hq".into(), Parameters::default(), NOW);
         assert!(again.reference().revision > keeper.reference().revision);
         change(&mut again, &select("mine", None), NOW);
-        assert_eq!(again.in_force().parameters.max_particles, 1500);
+        assert_eq!(particles_of(&again), 1500);
 
         let delete = ParamsAction::Delete { name: "mine".into() };
         assert!(again.plan(&delete, None).is_err(), "in force");

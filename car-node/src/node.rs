@@ -190,6 +190,12 @@ impl Node {
             set.parameters.clone(),
             seed,
         )?;
+        let known = match begin {
+            Begin::Pose(pose) => Some(pose),
+            Begin::Source => source.start(),
+            Begin::Global => None,
+        };
+        map.map.prepare(known, &set.parameters);
         let begins_with_a_pose = begin_at(&mut localizer, begin, source.start())?;
 
         let session = link::open(&connect)?;
@@ -223,6 +229,8 @@ impl Node {
         let mut monitor = Monitor::new(thresholds, clock.now());
         if begins_with_a_pose {
             monitor.on_new_pose(clock.now());
+        } else {
+            monitor.on_search(clock.now());
         }
         let filter = filter::start(
             Filter {
@@ -246,6 +254,7 @@ impl Node {
                 shared: Arc::clone(&shared),
                 clock,
                 session_number,
+                track_map: map.map,
                 map: map_message,
                 info,
             },

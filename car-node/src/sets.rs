@@ -75,10 +75,7 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
 
 /// A set as flat keys and values.
 pub fn values(parameters: &Parameters) -> BTreeMap<String, Value> {
-    match serde_json::to_value(parameters) {
-        Ok(Value::Object(values)) => values.into_iter().collect(),
-        _ => BTreeMap::new(),
-    }
+    parameters.to_values()
 }
 
 /// `base` with some values replaced. Refused whole, with every fault: a key that means nothing here is one.

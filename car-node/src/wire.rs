@@ -3,10 +3,10 @@
 use maps::{OccupancyGrid, Pose, Raceline};
 use nalgebra::Matrix3;
 use protocol::{
-    Cell, Cloud, CloudParticle, Covariance, EndPoint, EndPointKind, Health, Latency, MapRaceline, MapReply,
-    Pose2, PoseKind, RecordedOdometry, RecordedScan, ScanView, TrackPoint, Truth, Twist2, Value,
+    Candidate, Cell, Cloud, CloudParticle, Covariance, EndPoint, EndPointKind, Health, Latency, MapRaceline,
+    MapReply, Pose2, PoseKind, RecordedOdometry, RecordedScan, ScanView, TrackPoint, Truth, Twist2, Value,
 };
-use synpf::{Odometry, Scan, Twist};
+use synpf::{Hypothesis, Odometry, Scan, Twist};
 
 use crate::clock::SensorClock;
 use crate::counters::Spread;
@@ -282,6 +282,15 @@ pub fn map(name: &str, grid: &OccupancyGrid, raceline: Option<&Raceline>) -> Map
                 .map(|point| [point.x as f32, point.y as f32])
                 .collect(),
         }),
+    }
+}
+
+/// A candidate of a search; the best has index 0. Its score is the likelihood that its log stands for.
+pub fn candidate(index: usize, hypothesis: &Hypothesis) -> Candidate {
+    Candidate {
+        number: u32::try_from(index + 1).unwrap_or(u32::MAX),
+        pose: pose2(hypothesis.pose),
+        score: share(hypothesis.score.exp()),
     }
 }
 

@@ -1,2 +1,87 @@
-//! Placeholder.
-fn main() {}
+//! Three cars and a pit wall in one process: what the whole does, without a car, without Docker, without
+//! internet.
+
+mod cars;
+mod show;
+
+use std::net::SocketAddr;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Parser;
+use pitwall::{PageOptions, PitWall, Role, WallOptions};
+
+/// Three simulated cars race; a pit wall watches.
+#[derive(Debug, Parser)]
+#[command(name = "demo", version)]
+struct Options {
+    /// Track: club, hall, park or mirror, or a folder with map.yaml and raceline.csv.
+    #[arg(long, default_value = "club")]
+    track: String,
+    /// Number of cars.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=10))]
+    cars: u8,
+    /// Parameter set that the cars start with.
+    #[arg(long, default_value = "hq")]
+    params: String,
+    /// Seed of the race.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// End after this long, such as 30s or 5m; without it, Ctrl-C ends the demo.
+    #[arg(long = "for", value_name = "TIME", value_parser = show::duration)]
+    time: Option<Duration>,
+    /// Where the pit wall listens for cars.
+    #[arg(long, value_name = "ENDPOINT", default_value = pitwall::LOCAL_WALL)]
+    listen: String,
+    /// Where the pit wall's page is served.
+    #[arg(long, value_name = "ADDRESS:PORT", default_value_t = PageOptions::default().address)]
+    page: SocketAddr,
+    /// One JSON line a second with all cars, instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+fn main() -> ExitCode {
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_default_env()
+                .unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off".into()),
+        )
+        .with_writer(std::io::stderr)
+        .init();
+    match run(&Options::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            show::complain(&error);
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(options: &Options) -> anyhow::Result<()> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()?;
+    let wall = runtime
+        .block_on(PitWall::start(WallOptions {
+            role: Role::Router {
+                listen: vec![options.listen.clone()],
+                discoverable: false,
+            },
+            page: PageOptions {
+                address: options.page,
+                ..PageOptions::default()
+            },
+        }))
+        .context(
+            "if another pit wall runs here, give --listen tcp/127.0.0.1:PORT and --page 127.0.0.1:PORT",
+        )?;
+    let nodes = cars::start(options)?;
+    show::banner(options, wall.url());
+    let shown = runtime.block_on(show::until_the_end(wall.hub(), options.time, options.json));
+    cars::shutdown(nodes);
+    runtime.block_on(wall.stop());
+    shown
+}

@@ -200,6 +200,24 @@ fn print_one(report: &Report) {
             alignment.mean, alignment.p05
         );
     }
+    for (state, share) in &outcome.state_share {
+        println!(
+            "  {:<12} {:>8.1}%",
+            format!("{state:?}").to_uppercase(),
+            share * 100.0
+        );
+    }
+    if let Some(truth) = outcome.state_truth {
+        let percent =
+            |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{:.1}%", share * 100.0));
+        println!(
+            "  LOCALIZED is right {}, right is LOCALIZED {}; falsely LOST {}, falsely LOCALIZED {}",
+            percent(truth.precision),
+            percent(truth.recall),
+            truth.false_lost,
+            truth.false_localized
+        );
+    }
     if let Some(times) = outcome.update_us {
         println!(
             "  update       {:>9.0}  us p50, {:.0} p99, {:.0} max",

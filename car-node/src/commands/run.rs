@@ -29,7 +29,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         }
         (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
         (SourceKind::Simulator, _) => {
-            let track = Track::load(&arguments.map)?;
+            let track = Track::find(&arguments.map.to_string_lossy())?;
             let map = race_map(
                 track.name.clone(),
                 track.grid.clone(),

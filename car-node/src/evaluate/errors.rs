@@ -7,7 +7,7 @@ use synpf::Stamp;
 use super::statistics::ErrorSummary;
 
 /// Errors this soon after the first estimate are those of the start, and left out [s].
-const SETTLING: f64 = 2.0;
+pub(super) const SETTLING: f64 = 2.0;
 /// Further off than this is an excursion [m]...
 const EXCURSION_DISTANCE: f64 = 1.0;
 /// ...when it lasts this long [s].

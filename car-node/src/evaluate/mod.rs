@@ -2,6 +2,7 @@
 //! the times taken).
 
 mod errors;
+mod states;
 mod statistics;
 mod truth;
 
@@ -13,10 +14,12 @@ use serde::Serialize;
 use synpf::{Dropped, Localizer, SetUpError, Stamp, Update};
 
 pub use errors::{PoseErrors, Summaries};
+pub use states::{StateTruth, States};
 pub use statistics::{ErrorSummary, mean, percentile};
 pub use truth::Truth;
 
 use crate::bag::{Arrival, SensorEvent};
+use crate::health::{Monitor, State, Thresholds};
 
 /// Where a run starts from.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -68,6 +71,11 @@ pub struct Outcome {
     /// Errors against the truth, where there is any.
     #[serde(flatten)]
     pub errors: Option<Summaries>,
+    /// Share of the updates spent in each health state.
+    pub state_share: BTreeMap<State, f64>,
+    /// What the states are worth, where there is truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub state_truth: Option<StateTruth>,
     /// Scan alignment; None without an update.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub alignment: Option<AlignmentSummary>,
@@ -103,24 +111,41 @@ pub fn run(
     let (mut alignment, mut times_us, mut particles) = (Vec::new(), Vec::new(), Vec::new());
     let mut scans = 0;
     let mut latest_odometry = None;
+    let begin_at = arrivals.first().map_or(Stamp(0), |arrival| arrival.log_time);
+    let mut monitor = Monitor::new(Thresholds::default(), begin_at);
+    let mut states = States::default();
 
     for (index, arrival) in arrivals.iter().enumerate() {
         let result = match &arrival.event {
             SensorEvent::Odometry(odometry) => {
                 latest_odometry = Some(odometry.stamp);
-                localizer.on_odometry(odometry)
+                let result = localizer.on_odometry(odometry);
+                if result.is_ok() {
+                    monitor.on_odometry(arrival.log_time);
+                }
+                result
             }
             SensorEvent::YawRate(yaw_rate) => localizer.on_yaw_rate(yaw_rate),
             SensorEvent::Scan(scan) => {
                 if scans == 0 {
                     begin(localizer, truth, start, latest_odometry.unwrap_or(scan.stamp))?;
+                    match start {
+                        Start::Global => monitor.on_search(arrival.log_time),
+                        Start::Pose(_) | Start::Truth => monitor.on_new_pose(arrival.log_time),
+                    }
                 }
                 scans += 1;
                 let before = Instant::now();
                 let result = localizer.on_scan(scan);
                 let taken = before.elapsed();
+                if result.is_err() {
+                    monitor.on_refused_scan(arrival.log_time);
+                }
                 result.map(|update| {
-                    errors.push(update.stamp, update.pose, truth.at(update.stamp));
+                    let true_pose = truth.at(update.stamp);
+                    errors.push(update.stamp, update.pose, true_pose);
+                    let state = monitor.on_update(&update, arrival.log_time).state;
+                    states.push(update.stamp, state, update.pose, true_pose);
                     alignment.push(update.alignment);
                     times_us.push(microseconds(taken));
                     particles.push(update.particles as f64);
@@ -137,6 +162,8 @@ pub fn run(
         scans,
         updates: times_us.len(),
         dropped,
+        state_share: states.shares(),
+        state_truth: states.truth(),
         errors: (!truth.is_empty()).then(|| errors.summaries()).flatten(),
         alignment: mean(&alignment)
             .zip(percentile(&alignment, 0.05))

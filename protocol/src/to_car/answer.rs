@@ -72,7 +72,7 @@ pub struct Candidate {
     pub number: u32,
     /// `map_from_base_link`.
     pub pose: Pose2,
-    /// Share of the end points that lie on walls there, in `[0, 1]`.
+    /// How likely the last scans are there, per beam, in `[0, 1]`; only good for comparing candidates.
     pub score: f32,
 }
 

@@ -1,0 +1,106 @@
+//! What the health states are worth, held against the truth.
+
+use std::collections::BTreeMap;
+
+use maps::{Pose, wrap_angle};
+use serde::Serialize;
+use synpf::Stamp;
+
+use super::errors::SETTLING;
+use crate::health::State;
+
+/// LOCALIZED promises a position within this [m]...
+const POSITION: f64 = 0.2;
+/// ...and a heading within this [rad].
+const HEADING: f64 = 2.0 * std::f64::consts::PI / 180.0;
+
+/// How far LOCALIZED and LOST can be believed, over all updates but those of the first 2 s.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StateTruth {
+    /// Of the updates that were LOCALIZED, the share within 0.2 m and 2 deg of the truth; None without any.
+    pub precision: Option<f64>,
+    /// Of the updates within 0.2 m and 2 deg of the truth, the share that was LOCALIZED; None without any.
+    pub recall: Option<f64>,
+    /// Updates that were LOST though within 0.2 m and 2 deg of the truth.
+    pub false_lost: usize,
+    /// Updates further off than 1 m that were LOCALIZED.
+    pub false_localized: usize,
+}
+
+/// Collects states, update by update.
+#[derive(Debug, Default)]
+pub struct States {
+    first: Option<Stamp>,
+    counts: BTreeMap<State, usize>,
+    judged: usize,
+    right: usize,
+    localized: usize,
+    localized_and_right: usize,
+    false_lost: usize,
+    false_localized: usize,
+}
+
+impl States {
+    /// Adds an update.
+    pub fn push(&mut self, stamp: Stamp, state: State, estimate: Pose, truth: Option<Pose>) {
+        *self.counts.entry(state).or_default() += 1;
+        let first = *self.first.get_or_insert(stamp);
+        let Some(truth) = truth.filter(|_| stamp.since(first) >= SETTLING) else {
+            return;
+        };
+        let distance = estimate.distance(truth);
+        let right = distance < POSITION && wrap_angle(estimate.heading - truth.heading).abs() < HEADING;
+        let localized = state == State::Localized;
+        self.judged += 1;
+        self.right += usize::from(right);
+        self.localized += usize::from(localized);
+        self.localized_and_right += usize::from(localized && right);
+        self.false_lost += usize::from(state == State::Lost && right);
+        self.false_localized += usize::from(localized && distance > 1.0);
+    }
+
+    /// Share of the updates in each state.
+    pub fn shares(&self) -> BTreeMap<State, f64> {
+        let all: usize = self.counts.values().sum();
+        self.counts
+            .iter()
+            .map(|(state, count)| (*state, *count as f64 / all as f64))
+            .collect()
+    }
+
+    /// What the states are worth; None without truth.
+    pub fn truth(&self) -> Option<StateTruth> {
+        let share = |part: usize, whole: usize| (whole > 0).then(|| part as f64 / whole as f64);
+        (self.judged > 0).then(|| StateTruth {
+            precision: share(self.localized_and_right, self.localized),
+            recall: share(self.localized_and_right, self.right),
+            false_lost: self.false_lost,
+            false_localized: self.false_localized,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn precision_and_recall_count_what_they_should() {
+        let mut states = States::default();
+        let at = |second: i64| Stamp(second * 1_000_000_000);
+        let (near, far) = (Pose::new(0.1, 0.0, 0.0), Pose::new(1.5, 0.0, 0.0));
+        let truth = Some(Pose::IDENTITY);
+        states.push(at(0), State::Converging, far, truth);
+        states.push(at(2), State::Localized, near, truth);
+        states.push(at(3), State::Degraded, near, truth);
+        states.push(at(4), State::Lost, near, truth);
+        states.push(at(5), State::Localized, far, truth);
+        states.push(at(6), State::Localized, Pose::new(0.0, 0.0, 0.1), truth);
+        states.push(at(7), State::Localized, far, None);
+        let judged = states.truth().expect("judged");
+        assert_eq!(judged.precision, Some(1.0 / 3.0));
+        assert_eq!(judged.recall, Some(1.0 / 3.0));
+        assert_eq!((judged.false_lost, judged.false_localized), (1, 1));
+        assert!((states.shares()[&State::Localized] - 4.0 / 7.0).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,152 @@
+//! What the demo prints.
+#![allow(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "this is the program's output"
+)]
+
+use std::time::Duration;
+
+use pitwall::{CarView, Hub, unix_now};
+use protocol::Severity;
+
+use crate::Options;
+
+/// How often the cars are listed.
+const LIST: Duration = Duration::from_secs(10);
+/// How often news and JSON are written.
+const TICK: Duration = Duration::from_secs(1);
+
+/// Says what to look at.
+pub(crate) fn banner(options: &Options, url: &str) {
+    if options.json {
+        return;
+    }
+    println!(
+        "{} cars race on {}; the pit wall listens at {}.
+
+Open the page:  {url}
+
+Or look at it from another terminal:
+  pitwall cars                         who is localized, and who is not, and why
+  pitwall watch car-1                  one car, live
+  pitwall params car-1 select lq       another parameter set, on the running car
+  pitwall record -o race.mcap --for 30s
+(cargo run --release -p pitwall -- cars, and so on.)
+
+At 0:30 of every two minutes car-1 loses its grip for half a minute; at 1:20 the last car is knocked round.
+Ctrl-C ends the demo.
+",
+        options.cars, options.track, options.listen
+    );
+}
+
+/// Says why the demo failed.
+pub(crate) fn complain(error: &anyhow::Error) {
+    eprintln!("demo: {error:#}");
+}
+
+/// Shows what happens until the time is over or somebody presses Ctrl-C.
+pub(crate) async fn until_the_end(hub: &Hub, time: Option<Duration>, json: bool) -> anyhow::Result<()> {
+    let over = async {
+        match time {
+            Some(time) => tokio::time::sleep(time).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        result = show(hub, json) => result,
+        () = over => Ok(()),
+        result = tokio::signal::ctrl_c() => Ok(result?),
+    }
+}
+
+async fn show(hub: &Hub, json: bool) -> anyhow::Result<()> {
+    let mut ticks = tokio::time::interval(TICK);
+    let (mut seen, mut list_due) = (0, tokio::time::Instant::now() + LIST);
+    loop {
+        ticks.tick().await;
+        let (cars, news) = {
+            let fleet = hub.fleet();
+            let news: Vec<_> = fleet.log().since(seen).cloned().collect();
+            seen = fleet.log().last();
+            (fleet.view(unix_now()), news)
+        };
+        if json {
+            println!("{}", serde_json::to_string(&cars)?);
+            continue;
+        }
+        for entry in news {
+            let mark = match entry.severity {
+                Severity::Info => " ",
+                Severity::Warning => "!",
+                Severity::Critical => "#",
+            };
+            let car = entry.car.map_or_else(String::new, |car| car.to_string());
+            let who = entry.who.map_or_else(String::new, |who| format!(" ({who})"));
+            println!("{mark} {car:<8} {}{who}", entry.text);
+        }
+        if tokio::time::Instant::now() >= list_due {
+            list_due += LIST;
+            println!("{}", list(&cars));
+        }
+    }
+}
+
+/// The cars, a line each.
+fn list(cars: &[CarView]) -> String {
+    let mut text = format!(
+        "\n  {:<8} {:<13} {:<9} {:>5} {:>8} {:>8} {:>7} {:>7}",
+        "car", "state", "set", "lap", "last s", "speed", "align", "age ms"
+    );
+    for car in cars {
+        let or_dash = |value: Option<f64>, digits: usize| {
+            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.digits$}"))
+        };
+        let pose = car.pose.as_ref();
+        let metrics = car.health.as_ref().and_then(|health| health.metrics);
+        let line = format!(
+            "\n  {:<8} {:<13} {:<9} {:>5} {:>8} {:>8} {:>7} {:>7}",
+            car.car,
+            car.state,
+            car.set.as_ref().map_or("-", |set| set.name.as_str()),
+            pose.map_or(0, |pose| pose.lap),
+            or_dash(car.last_lap_s, 2),
+            or_dash(pose.map(|pose| pose.speed_mps), 1),
+            or_dash(metrics.map(|metrics| f64::from(metrics.alignment)), 2),
+            or_dash(pose.map(|pose| pose.age_s * 1e3), 0),
+        );
+        text.push_str(&line);
+    }
+    text + "\n"
+}
+
+/// `30s`, `5m`, or plain seconds.
+pub(crate) fn duration(text: &str) -> Result<Duration, String> {
+    let (number, unit) = text.split_at(text.find(|c: char| c.is_alphabetic()).unwrap_or(text.len()));
+    let scale = match unit {
+        "" | "s" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(format!("unknown unit {unit:?}; use s, m or h")),
+    };
+    let number: f64 = number
+        .parse()
+        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
+    Duration::try_from_secs_f64(number * scale).map_err(|error| format!("{text:?}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_parse_or_say_what_is_wrong() {
+        assert_eq!(duration("30s"), Ok(Duration::from_secs(30)));
+        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
+        assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
+        for text in ["", "s", "-1s", "1y", "NaN"] {
+            assert!(duration(text).is_err(), "{text}");
+        }
+    }
+}

@@ -35,6 +35,9 @@ pub enum SetUpError {
     /// A pose with a NaN or an infinity.
     #[error("pose {0:?} is not finite")]
     Pose(Pose),
+    /// A pose that is nowhere on the map.
+    #[error("pose ({:.2}, {:.2}) is off the map", .0.x, .0.y)]
+    OffMap(Pose),
 }
 
 /// Why a message did not lead to an update. Each is counted by the caller.
@@ -228,10 +231,13 @@ impl Localizer {
     }
 
     /// Starts from a pose of `base_link` in `map`, true at the latest odometry (or, before there is any, at the
-    /// first scan), with the set's initial spread.
+    /// first scan), with the set's initial spread. Fails for a pose that is not finite or not on the map's image.
     pub fn initialize(&mut self, pose: Pose) -> Result<(), SetUpError> {
         if !pose.is_finite() {
             return Err(SetUpError::Pose(pose));
+        }
+        if !self.map.covers(pose) {
+            return Err(SetUpError::OffMap(pose));
         }
         self.map.prepare(Some(pose), &self.parameters);
         let particles = &self.parameters.particles;

@@ -143,6 +143,13 @@ impl TrackMap {
         Arc::clone(self.cddt.get_or_init(|| Arc::new(Cddt::new(&self.field))))
     }
 
+    /// Whether a pose in `map` lies on the grid.
+    pub(crate) fn covers(&self, map_from_base_link: Pose) -> bool {
+        let at = self.grid_from_map * map_from_base_link;
+        let inside = |v: f64, cells: usize| (0.0..=cells as f64 * self.grid.resolution).contains(&v);
+        inside(at.x, self.grid.width) && inside(at.y, self.grid.height)
+    }
+
     pub(crate) fn coarse_field(&self) -> &CoarseField {
         self.coarse_field
             .get_or_init(|| CoarseField::new(&self.grid, &self.field))

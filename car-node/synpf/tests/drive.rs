@@ -1,0 +1,358 @@
+//! The localizer as a whole, on a track made of geometry.
+
+mod common;
+
+use std::sync::Arc;
+
+use common::{BASE_LINK_FROM_LASER, new_ring, odometry, ring, scan, truth};
+use maps::{Pose, wrap_angle};
+use proptest::prelude::*;
+use synpf::{
+    Dropped, Localizer, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModel, Stamp, TrackMap, Twist,
+    Update, YawRate,
+};
+
+fn localizer(map: &Arc<TrackMap>, parameters: Parameters, seed: u64) -> Localizer {
+    Localizer::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, seed).expect("sound")
+}
+
+fn named(name: &str) -> Parameters {
+    Parameters::named(name).expect("ships")
+}
+
+/// Drives from `from` to `to` [s] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
+fn drive(localizer: &mut Localizer, map: &TrackMap, from: f64, to: f64, scale: f64) -> Vec<Update> {
+    let (mut odom, mut next, mut updates) = (from, from, Vec::new());
+    while next < to {
+        while odom <= next {
+            localizer.on_odometry(&odometry(odom, scale)).expect("sound");
+            odom += 0.02;
+        }
+        updates.push(localizer.on_scan(&scan(map, next)).expect("an update"));
+        next += 0.025;
+    }
+    updates
+}
+
+fn error(update: &Update) -> f64 {
+    update
+        .pose
+        .distance(truth(update.stamp.since(common::stamp(0.0))))
+}
+
+#[test]
+fn every_set_follows_a_lap() {
+    let map = ring();
+    for (name, within) in [
+        ("hq", 0.03),
+        ("lq", 0.03),
+        ("adaptive", 0.03),
+        ("synpf-baseline", 0.5),
+    ] {
+        let mut localizer = localizer(&map, named(name), 1);
+        localizer.on_odometry(&odometry(0.0, 1.03)).expect("sound");
+        localizer.initialize(truth(0.0)).expect("finite");
+        let updates = drive(&mut localizer, &map, 0.02, common::lap(), 1.03);
+        let worst = updates[40..].iter().map(error).fold(0.0, f64::max);
+        assert!(worst < within, "{name}: {worst}");
+    }
+}
+
+#[test]
+fn every_model_and_method_follows_the_track() {
+    let map = ring();
+    let mut sets = Vec::new();
+    for model in ["tum", "amcl", "arc", "mit"] {
+        sets.push(
+            named("hq")
+                .with_values([("motion_model".into(), model.into())])
+                .expect(model)
+                .0,
+        );
+    }
+    for method in [RangeMethod::RayMarching, RangeMethod::Cddt] {
+        let mut set = named("hq");
+        set.sensor.range_method = method;
+        set.particles.max_particles = 400;
+        set.particles.min_particles = 400;
+        sets.push(set);
+    }
+    let mut field = named("hq");
+    field.sensor.sensor_model = SensorModel::LikelihoodField;
+    sets.push(field);
+    for mut set in sets {
+        // The particles alone, without the refinement that would cover for them.
+        set.refinement.refine = false;
+        let mut localizer = localizer(&map, set.clone(), 2);
+        localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+        localizer.initialize(truth(0.0)).expect("finite");
+        let updates = drive(&mut localizer, &map, 0.02, 3.0, 1.0);
+        let worst = updates[40..].iter().map(error).fold(0.0, f64::max);
+        assert!(
+            worst < 0.35,
+            "{:?} {:?}: {worst}",
+            set.motion.motion_model,
+            set.sensor
+        );
+    }
+}
+
+#[test]
+fn the_same_seed_and_log_give_the_same_bytes_whatever_the_threads() {
+    let map = ring();
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .expect("threads");
+        pool.install(|| {
+            let map = new_ring();
+            let mut localizer = localizer(&map, named("hq"), 5);
+            localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+            localizer.relocalize();
+            format!("{:?}", drive(&mut localizer, &map, 0.02, 1.5, 1.0))
+        })
+    };
+    assert_eq!(run(1), run(3));
+    let poses = |seed| {
+        let mut localizer = localizer(&map, Parameters::named("synpf-baseline").expect("ships"), seed);
+        localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+        localizer.initialize(truth(0.0)).expect("finite");
+        format!("{:?}", drive(&mut localizer, &map, 0.02, 0.5, 1.0))
+    };
+    assert_ne!(poses(1), poses(2), "the seed matters");
+}
+
+#[test]
+fn a_car_that_nobody_placed_finds_itself() {
+    let map = ring();
+    for start in [0.0, 2.5, 5.5] {
+        let mut localizer = localizer(&map, named("hq"), 3);
+        localizer.on_odometry(&odometry(start, 1.0)).expect("sound");
+        localizer.relocalize();
+        let updates = drive(&mut localizer, &map, start + 0.02, start + 3.0, 1.0);
+        let last = updates.last().expect("updates");
+        assert_eq!(last.mode, Mode::Tracking, "from {start}");
+        assert!(error(last) < 0.05, "from {start}: {}", error(last));
+    }
+}
+
+#[test]
+fn a_kidnapped_car_says_so_and_recovers() {
+    let map = ring();
+    let mut localizer = localizer(&map, named("hq"), 4);
+    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+    localizer.initialize(truth(0.0)).expect("finite");
+    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    // Somebody carries the car on by a third of the track: its pose is set where it no longer is.
+    let there = truth(1.0 + common::lap() / 3.0);
+    localizer.initialize(there).expect("finite");
+    let updates = drive(&mut localizer, &map, 1.02, 4.0, 1.0);
+    let noticed = updates
+        .iter()
+        .position(|update| update.mode == Mode::Searching)
+        .expect("noticed");
+    assert!(noticed < 40, "after {noticed} scans");
+    let last = updates.last().expect("updates");
+    assert!(
+        last.mode == Mode::Tracking && error(last) < 0.05,
+        "{}",
+        error(last)
+    );
+}
+
+#[test]
+fn a_set_swapped_in_mid_drive_keeps_the_pose() {
+    let map = ring();
+    let mut localizer = localizer(&map, named("hq"), 6);
+    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+    localizer.initialize(truth(0.0)).expect("finite");
+    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    for (k, name) in ["lq", "adaptive", "hq"].into_iter().enumerate() {
+        localizer.set_parameters(named(name)).expect("sound");
+        let from = 1.02 + 0.5 * k as f64;
+        let updates = drive(&mut localizer, &map, from, from + 0.48, 1.0);
+        assert!(updates.iter().all(|update| error(update) < 0.03), "{name}");
+    }
+    let mut bad = named("hq");
+    bad.sensor.sigma_hit = f64::NAN;
+    assert!(localizer.set_parameters(bad).is_err());
+    assert_eq!(localizer.parameters(), &named("hq"));
+}
+
+#[test]
+fn an_opponent_in_view_is_no_loss() {
+    let map = ring();
+    let mut localizer = localizer(&map, named("hq"), 7);
+    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+    localizer.initialize(truth(0.0)).expect("finite");
+    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    let mut odom = 1.0;
+    for k in 0..120 {
+        let at = 1.0 + 0.025 * f64::from(k + 1);
+        while odom <= at {
+            localizer
+                .on_odometry(&odometry(odom + 0.001, 1.0))
+                .expect("sound");
+            odom += 0.02;
+        }
+        let mut scan = scan(&map, at);
+        // A car close ahead takes a third of the field of view.
+        for range in &mut scan.ranges[180..360] {
+            *range = range.min(0.6);
+        }
+        let update = localizer.on_scan(&scan).expect("an update");
+        assert_eq!(update.mode, Mode::Tracking, "scan {k}");
+        assert!(error(&update) < 0.05, "scan {k}: {}", error(&update));
+        assert!(update.short_beams > 0.1);
+    }
+}
+
+#[test]
+fn what_is_missing_is_said() {
+    let map = ring();
+    let mut localizer = localizer(&map, named("hq"), 8);
+    assert_eq!(
+        localizer.on_scan(&scan(&map, 0.0)).err(),
+        Some(Dropped::NoOdometry)
+    );
+    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+    assert_eq!(
+        localizer.on_scan(&scan(&map, 0.01)).err(),
+        Some(Dropped::NotInitialized)
+    );
+    localizer.initialize(truth(0.0)).expect("finite");
+    assert!(localizer.on_scan(&scan(&map, 0.02)).is_ok());
+    assert_eq!(
+        localizer.on_scan(&scan(&map, 0.02)).err(),
+        Some(Dropped::TimeBackwards)
+    );
+    assert_eq!(
+        localizer.on_scan(&scan(&map, 5.0)).err(),
+        Some(Dropped::StaleOdometry)
+    );
+    assert_eq!(
+        localizer.on_odometry(&odometry(0.0, 1.0)).err(),
+        Some(Dropped::TimeBackwards)
+    );
+    assert!(
+        localizer
+            .initialize(Pose {
+                x: f64::NAN,
+                ..Pose::IDENTITY
+            })
+            .is_err()
+    );
+}
+
+#[test]
+fn a_map_without_room_is_refused() {
+    let walls = maps::OccupancyGrid::new(20, 20, 0.05, Pose::IDENTITY, vec![maps::Cell::Occupied; 400]);
+    let message = TrackMap::new(walls).expect_err("no room").to_string();
+    assert!(message.contains("20 x 20"), "{message}");
+}
+
+/// Any number at all, the odd ones often.
+fn any_f64() -> impl Strategy<Value = f64> {
+    prop_oneof![
+        4 => -10.0..10.0f64,
+        1 => any::<f64>(),
+        1 => prop_oneof![Just(f64::NAN), Just(f64::INFINITY), Just(0.0), Just(1e300), Just(-1e-300)],
+    ]
+}
+
+#[derive(Debug, Clone)]
+enum Message {
+    Odometry(Odometry),
+    YawRate(YawRate),
+    Scan(Scan),
+    GoodScan,
+    Initialize(Pose),
+    Relocalize,
+}
+
+fn any_message() -> impl Strategy<Value = Message> {
+    let stamp =
+        || prop_oneof![3 => (-1.0..2.0f64).prop_map(common::stamp), 1 => any::<i64>().prop_map(Stamp)];
+    let odometry = (stamp(), proptest::array::uniform6(any_f64())).prop_map(|(stamp, v)| {
+        Message::Odometry(Odometry {
+            stamp,
+            pose: Pose {
+                x: v[0],
+                y: v[1],
+                heading: v[2],
+            },
+            twist: Twist {
+                linear_x: v[3],
+                linear_y: v[4],
+                angular: v[5],
+            },
+        })
+    });
+    let ranges = proptest::collection::vec(prop_oneof![3 => 0.0..30.0f32, 1 => any::<f32>()], 0..300);
+    let scan = (stamp(), proptest::array::uniform5(any_f64()), ranges).prop_map(|(stamp, v, ranges)| {
+        Message::Scan(Scan {
+            stamp,
+            angle_min: v[0],
+            angle_increment: v[1] * 0.01,
+            time_increment: v[2].abs() * 1e-6,
+            range_min: v[3],
+            range_max: v[4].abs() * 10.0,
+            ranges,
+        })
+    });
+    prop_oneof![
+        3 => odometry,
+        1 => (stamp(), any_f64()).prop_map(|(stamp, rate)| Message::YawRate(YawRate { stamp, rate })),
+        3 => scan,
+        3 => Just(Message::GoodScan),
+        1 => (any_f64(), any_f64(), any_f64()).prop_map(|(x, y, heading)| Message::Initialize(Pose { x, y, heading })),
+        1 => Just(Message::Relocalize),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// Whatever arrives in whatever order: an update with numbers in it, or a reason; never a panic, never a NaN.
+    #[test]
+    fn nothing_that_arrives_breaks_the_filter(
+        messages in proptest::collection::vec(any_message(), 1..40),
+        set in 0..Parameters::NAMES.len(),
+    ) {
+        let map = ring();
+        let mut parameters = named(Parameters::NAMES[set]);
+        parameters.particles.max_particles = 100;
+        parameters.particles.min_particles = 50;
+        let mut localizer = localizer(&map, parameters, 9);
+        let mut clock = 0.0;
+        for message in messages {
+            clock += 0.025;
+            let outcome = match message {
+                Message::Odometry(odometry) => localizer.on_odometry(&odometry).map(|()| None),
+                Message::YawRate(rate) => localizer.on_yaw_rate(&rate).map(|()| None),
+                Message::Scan(scan) => localizer.on_scan(&scan).map(Some),
+                Message::GoodScan => {
+                    let _late = localizer.on_odometry(&odometry(clock, 1.0));
+                    localizer.on_scan(&scan(&map, clock)).map(Some)
+                }
+                Message::Initialize(pose) => {
+                    let _refused = localizer.initialize(pose);
+                    Ok(None)
+                }
+                Message::Relocalize => {
+                    localizer.relocalize();
+                    Ok(None)
+                }
+            };
+            if let Ok(Some(update)) = outcome {
+                prop_assert!(update.pose.is_finite(), "{update:?}");
+                prop_assert!(update.covariance.iter().all(|v| v.is_finite()), "{update:?}");
+                prop_assert!((0.0..=1.0).contains(&update.alignment), "{update:?}");
+                prop_assert!(wrap_angle(update.pose.heading).is_finite());
+                prop_assert!([update.ess_ratio, update.residual, update.w_ratio, update.slip, update.innovation[0]]
+                    .iter().all(|v| v.is_finite()), "{update:?}");
+            }
+        }
+    }
+}

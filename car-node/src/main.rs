@@ -10,9 +10,11 @@ use clap::Parser;
 use cli::{Cli, Command};
 
 fn main() -> ExitCode {
+    // zenoh warns of what is meant to be so; what concerns the driver we say ourselves.
     tracing_subscriber::fmt()
         .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn".into()),
+            tracing_subscriber::EnvFilter::try_from_default_env()
+                .unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off".into()),
         )
         .with_writer(std::io::stderr)
         .init();

@@ -1,11 +1,7 @@
 //! What the program writes: results on stdout, everything else on stderr.
-#![expect(
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "a program's output goes somewhere"
-)]
+#![expect(clippy::print_stderr, reason = "a program's output goes somewhere")]
 
-use std::io::{IsTerminal, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 
 use anyhow::Context;
 use pitwall::CarView;
@@ -13,13 +9,24 @@ use serde::Serialize;
 
 /// A result.
 pub(crate) fn say(text: &str) {
-    println!("{text}");
+    write(&format!("{text}\n"));
+}
+
+/// Ends the program quietly when nobody reads on, as after `| head`; `println!` would panic.
+fn write(text: &str) {
+    let mut out = std::io::stdout().lock();
+    if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        if error.kind() != ErrorKind::BrokenPipe {
+            complain(&format!("stdout: {error}"));
+        }
+        std::process::exit(1);
+    }
 }
 
 /// A result in JSON, on one line.
 pub(crate) fn say_json(value: &impl Serialize) -> anyhow::Result<()> {
     let text = serde_json::to_string(value).context("writing JSON")?;
-    println!("{text}");
+    say(&text);
     Ok(())
 }
 
@@ -42,8 +49,7 @@ pub(crate) fn on_terminal() -> bool {
 pub(crate) fn redraw(text: &str) {
     // Home, then each line cleared to its end, then the rest of the screen.
     let lines = text.replace('\n', "\x1b[K\n");
-    print!("\x1b[H{lines}\x1b[K\n\x1b[J");
-    drop(std::io::stdout().flush());
+    write(&format!("\x1b[H{lines}\x1b[K\n\x1b[J"));
 }
 
 /// One line a car.

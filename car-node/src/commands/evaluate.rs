@@ -69,8 +69,8 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     }
 
     match &reports[..] {
-        [report] if arguments.json => println!("{}", serde_json::to_string_pretty(report)?),
-        reports if arguments.json => println!("{}", serde_json::to_string_pretty(reports)?),
+        [report] if arguments.json => say!("{}", serde_json::to_string_pretty(report)?),
+        reports if arguments.json => say!("{}", serde_json::to_string_pretty(reports)?),
         [report] => print_one(report),
         reports => print_table(reports),
     }
@@ -163,22 +163,22 @@ fn print_one(report: &Report) {
     let Report {
         outcome, range_table, ..
     } = report;
-    println!(
+    say!(
         "{}  set {}, seed {}",
         report.bag.display(),
         report.params,
         report.seed
     );
-    println!("  scans        {:>9}", outcome.scans);
-    println!("  updates      {:>9}", outcome.updates);
+    say!("  scans        {:>9}", outcome.scans);
+    say!("  updates      {:>9}", outcome.updates);
     for (cause, count) in &outcome.dropped {
-        println!("  dropped      {count:>9}  {cause}");
+        say!("  dropped      {count:>9}  {cause}");
     }
     match &outcome.errors {
         Some(errors) => {
-            println!("  error             mean      rmse       p95       max");
+            say!("  error             mean      rmse       p95       max");
             let line = |name: &str, unit: &str, scale: f64, of: &ErrorSummary| {
-                println!(
+                say!(
                     "  {name:<12} {:>9.2} {:>9.2} {:>9.2} {:>9.2}  {unit}",
                     of.mean * scale,
                     of.rmse * scale,
@@ -190,14 +190,15 @@ fn print_one(report: &Report) {
             line("lateral", "cm", 100.0, &errors.lateral_error_m);
             line("longitudinal", "cm", 100.0, &errors.longitudinal_error_m);
             line("heading", "deg", 1_f64.to_degrees(), &errors.heading_error_rad);
-            println!("  excursions   {:>9}", errors.excursions);
+            say!("  excursions   {:>9}", errors.excursions);
         }
-        None => println!("  error        no truth to compare with"),
+        None => say!("  error        no truth to compare with"),
     }
     if let Some(alignment) = outcome.alignment {
-        println!(
+        say!(
             "  alignment    {:>9.3}  mean, {:.3} p05",
-            alignment.mean, alignment.p05
+            alignment.mean,
+            alignment.p05
         );
     }
     for (state, share) in &outcome.state_share {
@@ -219,15 +220,17 @@ fn print_one(report: &Report) {
         );
     }
     if let Some(times) = outcome.update_us {
-        println!(
+        say!(
             "  update       {:>9.0}  us p50, {:.0} p99, {:.0} max",
-            times.p50, times.p99, times.max
+            times.p50,
+            times.p99,
+            times.max
         );
     }
     if let Some(particles) = outcome.particles {
-        println!("  particles    {:>9.0}", particles.mean);
+        say!("  particles    {:>9.0}", particles.mean);
     }
-    println!(
+    say!(
         "  range table  {:>9.0}  ms, {:.1} MB",
         range_table.build_ms,
         range_table.bytes as f64 / 1e6
@@ -236,7 +239,7 @@ fn print_one(report: &Report) {
 
 /// Several runs, a row each.
 fn print_table(reports: &[Report]) {
-    println!(
+    say!(
         "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
         "bag",
         "seed",
@@ -252,9 +255,16 @@ fn print_table(reports: &[Report]) {
         "us p50",
         "us p99"
     );
-    println!(
+    say!(
         "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8}",
-        "", "", "", "", "cm", "cm", "cm", "deg"
+        "",
+        "",
+        "",
+        "",
+        "cm",
+        "cm",
+        "cm",
+        "deg"
     );
     let mut previous = None;
     for report in reports {
@@ -270,7 +280,7 @@ fn print_table(reports: &[Report]) {
             short_name(&report.bag)
         };
         previous = Some(&report.bag);
-        println!(
+        say!(
             "{name:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
             report.seed,
             outcome.updates,

@@ -1,15 +1,20 @@
 //! One file per subcommand.
 #![allow(
-    clippy::print_stdout,
     clippy::print_stderr,
     reason = "commands print: results on stdout, the rest on stderr"
 )]
+
+/// A line of a result.
+macro_rules! say {
+    ($($line:tt)*) => { $crate::commands::say(&format!($($line)*)) };
+}
 
 pub(crate) mod evaluate;
 pub(crate) mod race;
 pub(crate) mod run;
 pub(crate) mod track;
 
+use std::io::{ErrorKind, Write};
 use std::path::Path;
 
 use car_node::bag::{Bag, SensorLog, Topics};
@@ -17,6 +22,17 @@ use car_node::frames::Mount;
 use car_node::sets::{self, NamedSet};
 
 use crate::cli::TopicArguments;
+
+/// Ends the program quietly when nobody reads on, as after `| head`; `println!` would panic.
+fn say(line: &str) {
+    let mut out = std::io::stdout().lock();
+    if let Err(error) = writeln!(out, "{line}") {
+        if error.kind() != ErrorKind::BrokenPipe {
+            eprintln!("car-node: stdout: {error}");
+        }
+        std::process::exit(1);
+    }
+}
 
 /// Reads what a localizer needs of a bag.
 fn read_bag(bag: &Path, arguments: &TopicArguments) -> anyhow::Result<SensorLog> {

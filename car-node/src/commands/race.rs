@@ -42,7 +42,7 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
     };
     let report = races(arguments, &track, &map, localizer, guide, quality)?;
     if arguments.json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        say!("{}", serde_json::to_string_pretty(&report)?);
     } else {
         print_one(&report);
     }
@@ -162,7 +162,7 @@ fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyh
         reports.push(report);
     }
     if arguments.json {
-        println!("{}", serde_json::to_string_pretty(&reports)?);
+        say!("{}", serde_json::to_string_pretty(&reports)?);
     } else {
         print_table(arguments, &reports);
     }
@@ -181,13 +181,13 @@ fn mean_sigma(value: Option<MeanSigma>, scale: f64, digits: usize) -> String {
 }
 
 fn print_table(arguments: &cli::Race, reports: &[Report]) {
-    println!(
+    say!(
         "{} laps on {}, {} seed(s)",
         arguments.laps,
         reports.first().map_or("", |report| &report.track),
         arguments.seeds
     );
-    println!(
+    say!(
         "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
         "localizer",
         "odom",
@@ -200,13 +200,22 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
         "load",
         "crashes"
     );
-    println!(
+    say!(
         "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
-        "", "", "s", "cm", "%", "%", "cm", "deg", "% core", ""
+        "",
+        "",
+        "s",
+        "cm",
+        "%",
+        "%",
+        "cm",
+        "deg",
+        "% core",
+        ""
     );
     for report in reports {
         let s = &report.summary;
-        println!(
+        say!(
             "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7.2} {:>8}",
             report.localizer,
             name(report.odometry),
@@ -220,10 +229,10 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
             crashes(s),
         );
     }
-    println!("the paper, table I (10 laps of a real car on its own track):");
+    say!("the paper, table I (10 laps of a real car on its own track):");
     for row in PAPER_ROWS {
         let pair = |[mean, sigma]: [f64; 2]| Some(MeanSigma { mean, sigma });
-        println!(
+        say!(
             "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
             row.localizer,
             name(row.quality),
@@ -250,7 +259,7 @@ fn crashes(summary: &RaceSummary) -> String {
 
 fn print_one(report: &Report) {
     let s = &report.summary;
-    println!(
+    say!(
         "{}  {}, {} odometry, {} laps, {} of {} cars finished",
         report.track,
         report.localizer,
@@ -259,7 +268,7 @@ fn print_one(report: &Report) {
         s.finished,
         s.started
     );
-    let line = |name: &str, value: String, unit: &str| println!("  {name:<22} {value:>17}  {unit}");
+    let line = |name: &str, value: String, unit: &str| say!("  {name:<22} {value:>17}  {unit}");
     line("lap time", mean_sigma(s.lap_time_s, 1.0, 3), "s");
     line(
         "estimate to line",

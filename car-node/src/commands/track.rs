@@ -65,7 +65,7 @@ fn new(folder: &Path, spec: &TrackSpec, text: &str, force: bool, json: bool) -> 
 fn check(track: &Track, json: bool) -> anyhow::Result<()> {
     let report = TrackReport::of(track);
     if json {
-        println!("{}", serde_json::to_string_pretty(&report)?);
+        say!("{}", serde_json::to_string_pretty(&report)?);
     } else {
         print(&report);
     }
@@ -77,8 +77,8 @@ fn check(track: &Track, json: bool) -> anyhow::Result<()> {
 }
 
 fn print(report: &TrackReport) {
-    println!("{}", report.name);
-    let line = |name: &str, value: String| println!("  {name:<12} {value}");
+    say!("{}", report.name);
+    let line = |name: &str, value: String| say!("  {name:<12} {value}");
     line(
         "lap",
         format!(
@@ -134,6 +134,6 @@ fn draw(track: &Track, svg: Option<&Path>, columns: usize) -> anyhow::Result<()>
     if !grid.cells.iter().copied().any(free) {
         bail!("{}: the map has no free cell", track.name);
     }
-    print!("{}", drawing::terminal(track, columns));
+    say!("{}", drawing::terminal(track, columns).trim_end_matches('\n'));
     Ok(())
 }

@@ -202,7 +202,7 @@ fn print_one(report: &Report) {
         );
     }
     for (state, share) in &outcome.state_share {
-        println!(
+        say!(
             "  {:<12} {:>8.1}%",
             format!("{state:?}").to_uppercase(),
             share * 100.0
@@ -211,7 +211,7 @@ fn print_one(report: &Report) {
     if let Some(truth) = outcome.state_truth {
         let percent =
             |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{:.1}%", share * 100.0));
-        println!(
+        say!(
             "  LOCALIZED is right {}, right is LOCALIZED {}; falsely LOST {}, falsely LOCALIZED {}",
             percent(truth.precision),
             percent(truth.recall),

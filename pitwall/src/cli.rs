@@ -25,8 +25,8 @@ pub(crate) struct Cli {
 #[derive(Debug, Args)]
 pub(crate) struct Page {
     /// Where the page is served. On any but a loopback address it asks for the token that is printed.
-    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:7448")]
-    pub(crate) page: SocketAddr,
+    #[arg(long = "page", value_name = "ADDRESS:PORT", default_value = "127.0.0.1:7448")]
+    pub(crate) address: SocketAddr,
     /// The folder that recordings started from the page go to.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     pub(crate) recordings: PathBuf,

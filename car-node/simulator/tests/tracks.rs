@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use maps::Cell;
+use maps::{Cell, OccupancyGrid};
 use simulator::{BUNDLED, Track, TrackSpec};
 
 fn folder(name: &str) -> PathBuf {
@@ -37,9 +37,11 @@ fn the_bundled_club_is_what_its_description_makes() {
         .generate()
         .expect("room enough");
     let kept = Track::load(folder("club")).expect("a bundled track");
-    assert_eq!(
-        made.grid.to_png(),
-        std::fs::read(folder("club").join("map.png")).expect("a bundled map")
+    // As read back, because the bytes of a PNG depend on the compressor that the build has picked.
+    let made_grid = OccupancyGrid::from_parts(&made.grid.to_yaml("map.png"), &made.grid.to_png());
+    assert!(
+        made_grid.expect("just written") == kept.grid,
+        "maps/tracks/club/map.png is not what track.yaml makes"
     );
     assert_eq!(made.raceline.to_csv(), kept.raceline.to_csv());
     assert_eq!(made.walls.to_csv(), kept.walls.to_csv());

@@ -234,6 +234,7 @@ impl Keeper {
                 }
             }
             ParamsAction::List => Ok(Decision::Sets(self.list())),
+            ParamsAction::Shadow { .. } => Err(fault("no set can run in the shadow on this car yet".into())),
         }
     }
 

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{
-    CarInfo, CarName, Cloud, EventKind, Header, Health, Load, MapReply, Params, Pose, ScanView, State,
-    Telemetry, Topic, Truth,
+    CarInfo, CarName, Cloud, EventKind, Header, Health, Load, MapReply, Params, Pose, ScanView, Shadow,
+    State, Telemetry, Topic, Truth,
 };
 use serde::Serialize;
 
@@ -36,6 +36,8 @@ pub struct Car {
     pub load: Option<Load>,
     /// The set in force.
     pub params: Option<Params>,
+    /// The set that runs in the shadow, and how it compares.
+    pub shadow: Option<Shadow>,
     /// Where it really is, where that is known.
     pub truth: Option<Truth>,
     /// The map it localizes on, and the bytes that it came in.
@@ -92,6 +94,7 @@ impl Car {
             health: None,
             load: None,
             params: None,
+            shadow: None,
             truth: None,
             map: None,
             info: None,
@@ -117,6 +120,7 @@ impl Car {
             Telemetry::Health(health) => self.health = Some(health.clone()),
             Telemetry::Load(load) => self.load = Some(load.clone()),
             Telemetry::Params(params) => self.params = Some(params.clone()),
+            Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
             Telemetry::Truth(truth) => self.truth = Some(*truth),
             Telemetry::Event(event) => {
                 if let EventKind::Lap {
@@ -228,6 +232,7 @@ impl Car {
                     .as_ref()
                     .map(|revert| seconds(revert.at - now - offset).max(0.0)),
             }),
+            shadow: self.shadow.clone().filter(|shadow| shadow.set.is_some()),
             health: self.health.clone(),
             load: self.load.clone(),
             round_trip_s: self.clock.map(|clock| seconds(clock.round_trip)),
@@ -265,6 +270,8 @@ pub struct CarView {
     pub pose: Option<PoseView>,
     /// The parameter set in force.
     pub set: Option<SetView>,
+    /// The set in the shadow and how it compares; None without one.
+    pub shadow: Option<Shadow>,
     /// The newest health message.
     pub health: Option<Health>,
     /// The newest load message.

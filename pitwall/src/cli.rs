@@ -184,6 +184,11 @@ pub(crate) enum ParamsVerb {
         #[command(flatten)]
         change: Expect,
     },
+    /// Run a set beside the one in force, on the same scans, and see how the two compare.
+    Shadow {
+        /// Its name, or `off`; without it, the comparison is shown.
+        name: Option<String>,
+    },
     /// Delete a set that was put on the car.
     Delete {
         /// Its name.

@@ -155,14 +155,17 @@ fn entry_of(event: &Event, car: &CarName, at: i64) -> LogEntry {
         | EventKind::SetStored { .. }
         | EventKind::SetDeleted { .. }
         | EventKind::Proposed { .. }
-        | EventKind::AutoChanged { .. } => "set",
+        | EventKind::AutoChanged { .. }
+        | EventKind::ShadowStarted { .. }
+        | EventKind::ShadowEnded { .. }
+        | EventKind::ShadowDropped { .. } => "set",
         EventKind::PoseInitialized { .. } | EventKind::SearchStarted | EventKind::Relocalized { .. } => {
             "pose"
         }
         EventKind::Lap { .. } => "lap",
         EventKind::SlipStarted { .. } | EventKind::SlipEnded { .. } => "slip",
         EventKind::Started { .. } | EventKind::Stopping { .. } | EventKind::SourceEnded => "node",
-        EventKind::RatesChanged => "rates",
+        EventKind::RatesChanged | EventKind::RatesLowered { .. } | EventKind::RatesRestored => "rates",
         EventKind::CommandRefused { .. } => "refused",
         EventKind::Warning { .. } => "warning",
         EventKind::Error { .. } => "error",

@@ -163,7 +163,7 @@ impl Link {
             match topic {
                 Topic::Alive => live.push(Box::new(alive(&session, &sink).await?)),
                 // Newest wins: whatever comes, as it comes.
-                Topic::Pose | Topic::Cloud | Topic::Scan | Topic::Load | Topic::Params => {
+                Topic::Pose | Topic::Cloud | Topic::Scan | Topic::Load | Topic::Params | Topic::Shadow => {
                     live.push(Box::new(plain(&session, topic, &arrivals).await?));
                 }
                 // The display follows the plain subscriber: the other one holds back what comes after a gap until

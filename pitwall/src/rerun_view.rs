@@ -198,7 +198,10 @@ impl EventLog {
                         format!("plots/{car}/update_ms"),
                         &Scalars::single(f64::from(load.update_us.p99) / 1e3),
                     ),
-                    Telemetry::Odometry(_) | Telemetry::RecordedScan(_) | Telemetry::Truth(_) => Ok(()),
+                    Telemetry::Odometry(_)
+                    | Telemetry::RecordedScan(_)
+                    | Telemetry::Truth(_)
+                    | Telemetry::Shadow(_) => Ok(()),
                 }
             }
             _ => Ok(()),

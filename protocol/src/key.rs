@@ -105,11 +105,15 @@ pub enum Topic {
     CmdRates,
     /// [`Command`](crate::Command) that turns automatic switching on or off.
     CmdAuto,
+    /// [`Shadow`](crate::Shadow), newest wins.
+    Shadow,
+    /// [`LinkReport`](crate::LinkReport), put by the pit wall.
+    Link,
 }
 
 impl Topic {
     /// The key table.
-    const TABLE: [(Self, &'static str); 21] = [
+    const TABLE: [(Self, &'static str); 23] = [
         (Self::Alive, "alive"),
         (Self::Pose, "pose"),
         (Self::Cloud, "cloud"),
@@ -131,6 +135,8 @@ impl Topic {
         (Self::CmdRelocalize, "cmd/relocalize"),
         (Self::CmdRates, "cmd/rates"),
         (Self::CmdAuto, "cmd/auto"),
+        (Self::Shadow, "shadow"),
+        (Self::Link, "link"),
     ];
 
     /// Every topic.

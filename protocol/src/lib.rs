@@ -1,10 +1,11 @@
 //! What crosses the network between the cars and the pit wall.
 //!
 //! ```text
-//! car  --- pose, cloud, scan, health, load, params, event, recorded/* --->  pit wall      (telemetry)
+//! car  --- pose, cloud, scan, health, load, params, shadow, event, recorded/* --->  pit wall      (telemetry)
 //! car  <-- map?, info?, clock?  -----------------------------------------  pit wall      (questions)
 //! car  <-- cmd/params, cmd/pose, cmd/relocalize, cmd/rates, cmd/auto ----  pit wall      (commands)
 //!      --- answer: done at update N | refused | stale revision ---------->
+//! car  <-- link (how late its poses arrive) -----------------------------  pit wall
 //! ```
 //!
 //! Each message travels under the key `synpf/v1/<car>/<topic>` ([`Key`]) as a fixed [`Header`] followed by its
@@ -49,12 +50,12 @@ pub use key::{CarName, Key, KeyError, Topic};
 pub use message::{Invalid, Message, Schema};
 pub use telemetry::Telemetry;
 pub use to_car::{
-    Action, Answer, Candidate, Command, CommandId, IdError, Outcome, ParamsAction, Rates, RatesAction,
-    RelocalizeAction, Reply, StoredSet,
+    Action, Answer, Candidate, Command, CommandId, IdError, LinkReport, Outcome, ParamsAction, Rates,
+    RatesAction, RelocalizeAction, Reply, StoredSet,
 };
 pub use to_wall::{
-    CarInfo, Cause, CauseKind, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Drops, EndPoint,
-    EndPointKind, Event, EventKind, Health, Latency, Load, MapRaceline, MapReply, Metrics, ParameterSet,
-    Params, PendingRevert, Pose, PoseKind, Proposal, RecordedOdometry, RecordedScan, ScanView, SetRef,
-    Severity, State, TrackPoint, Truth, Value,
+    CarInfo, Cause, CauseKind, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Comparison, Drops,
+    EndPoint, EndPointKind, Event, EventKind, Fitness, Health, Latency, Load, MapRaceline, MapReply, Metrics,
+    ParameterSet, Params, PendingRevert, Pose, PoseKind, Proposal, RecordedOdometry, RecordedScan, ScanView,
+    SetRef, Severity, Shadow, State, TrackPoint, Truth, Value,
 };

@@ -108,4 +108,8 @@ schemas! {
     Command = 15,
     /// [`Answer`](crate::Answer)
     Answer = 16,
+    /// [`Shadow`](crate::Shadow)
+    Shadow = 17,
+    /// [`LinkReport`](crate::LinkReport)
+    LinkReport = 18,
 }

@@ -2,7 +2,7 @@
 
 use crate::{
     Cloud, CodecError, Event, Header, Health, Load, Params, Pose, RecordedOdometry, RecordedScan, ScanView,
-    Topic, Truth, decode,
+    Shadow, Topic, Truth, decode,
 };
 
 /// A message from a car, told apart by its topic.
@@ -28,6 +28,8 @@ pub enum Telemetry {
     RecordedScan(RecordedScan),
     /// On [`Topic::RecordedTruth`].
     Truth(Truth),
+    /// On [`Topic::Shadow`].
+    Shadow(Shadow),
 }
 
 impl Telemetry {
@@ -50,6 +52,7 @@ impl Telemetry {
             Topic::RecordedOdometry => with(bytes, Self::Odometry),
             Topic::RecordedScan => with(bytes, Self::RecordedScan),
             Topic::RecordedTruth => with(bytes, Self::Truth),
+            Topic::Shadow => with(bytes, Self::Shadow),
             Topic::Alive
             | Topic::Map
             | Topic::Info
@@ -58,7 +61,8 @@ impl Telemetry {
             | Topic::CmdPose
             | Topic::CmdRelocalize
             | Topic::CmdRates
-            | Topic::CmdAuto => return None,
+            | Topic::CmdAuto
+            | Topic::Link => return None,
         })
     }
 }

@@ -6,13 +6,18 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use protocol::{Action, CarName, ParameterSet, Params, ParamsAction, Reply, StoredSet, Value};
+use protocol::{
+    Action, CarName, Comparison, Fitness, ParameterSet, Params, ParamsAction, Reply, Shadow, StoredSet, Value,
+};
 use serde::Deserialize;
 
 use super::steer::{give, reply, tell};
 use super::{FIND, no_such_car, open};
-use crate::cli::{LinkOptions, ParamsVerb};
+use crate::cli::{Expect, LinkOptions, ParamsVerb};
 use crate::output;
+
+/// Exit code: no answer in time.
+const NO_ANSWER: u8 = 5;
 
 pub(super) async fn run(
     link: &LinkOptions,
@@ -25,6 +30,11 @@ pub(super) async fn run(
         None | Some(ParamsVerb::Get) => return get(link, car, json).await,
         Some(ParamsVerb::List) => return list(link, car, None, json).await,
         Some(ParamsVerb::Diff { a, b }) => return list(link, car, Some((a, b)), json).await,
+        Some(ParamsVerb::Shadow { name: None }) => return shadow(link, car, json).await,
+        Some(ParamsVerb::Shadow { name }) => {
+            let name = name.filter(|name| name != "off");
+            (ParamsAction::Shadow { name }, Expect { expect: None })
+        }
         Some(ParamsVerb::Select { name, change }) => {
             let revert_after_ms = change.revert_after.map(millis).transpose()?;
             (
@@ -49,7 +59,6 @@ pub(super) async fn run(
 
 /// The set in force, as the car last said it.
 async fn get(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
-    const NO_ANSWER: u8 = 5;
     let hub = open(link).await?;
     if !hub.wait_for(car, FIND).await {
         return Ok(no_such_car(&hub, car).await);
@@ -98,6 +107,89 @@ fn values(set: &ParameterSet) -> Vec<String> {
     let width = set.values.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
     let line = |(name, value): &(String, Value)| format!("  {name:<width$}  {value}");
     set.values.iter().map(line).collect()
+}
+
+/// How the set in the shadow compares, as the car last said it.
+async fn shadow(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(no_such_car(&hub, car).await);
+    }
+    hub.wait_until(FIND, |fleet| {
+        fleet.car(car).is_some_and(|car| car.shadow.is_some())
+    })
+    .await;
+    let shadow = hub.fleet().car(car).and_then(|car| car.shadow.clone());
+    hub.close().await;
+    let Some(shadow) = shadow else {
+        output::complain(&format!(
+            "{car}: NO ANSWER: it has not said whether a set runs in the shadow. Is its node older than this program?"
+        ));
+        return Ok(ExitCode::from(NO_ANSWER));
+    };
+    if json {
+        output::say_json(&shadow)?;
+    } else {
+        output::say(&compare(car, &shadow));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn compare(car: &CarName, shadow: &Shadow) -> String {
+    let Shadow {
+        set, who, comparison, ..
+    } = shadow;
+    let Some(set) = set else {
+        return match who.as_str() {
+            "load" => {
+                format!("no set runs in the shadow: {car} dropped it to save CPU, see `pitwall events {car}`")
+            }
+            _ => format!("no set runs in the shadow; `pitwall params {car} shadow NAME` starts one"),
+        };
+    };
+    let Some(comparison) = comparison else {
+        return format!("{set} runs in the shadow for {who}; nothing to compare yet");
+    };
+    let Comparison {
+        in_force,
+        window,
+        scans,
+        skipped,
+        force,
+        shadow: other,
+        distance,
+        distance_max,
+        angle,
+        force_better,
+        shadow_better,
+    } = comparison;
+    let row = |what: &str, of: &dyn Fn(&Fitness) -> String| {
+        format!("{what:<26} {:>14} {:>14}", of(force), of(other))
+    };
+    [
+        format!("{:<26} {:>14} {set:>14}", "", in_force.name),
+        row("alignment", &|f| format!("{:.3}", f.alignment)),
+        row("residual [m]", &|f| format!("{:.4}", f.residual)),
+        row("innovation [m]", &|f| format!("{:.4}", f.innovation)),
+        row("spread along, across [m]", &|f| {
+            format!("{:.3}, {:.3}", f.spread_along, f.spread_across)
+        }),
+        row("update p50, p99 [ms]", &|f| {
+            format!("{:.2}, {:.2}", f.update_us.p50 / 1e3, f.update_us.p99 / 1e3)
+        }),
+        format!(
+            "{:<26} {:>12.0} % {:>12.0} %",
+            "fits better",
+            force_better * 100.0,
+            shadow_better * 100.0
+        ),
+        format!(
+            "poses apart by {distance:.3} m (at most {distance_max:.3} m) and {:.2} deg; {scans} scans in {window:.1} s, \
+             {skipped} left out in the shadow",
+            angle.to_degrees()
+        ),
+    ]
+    .join("\n")
 }
 
 /// All sets, or how two of them differ.

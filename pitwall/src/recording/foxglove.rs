@@ -44,6 +44,7 @@ pub(super) fn export(car: &CarName, header: &Header, telemetry: &Telemetry) -> V
         Telemetry::Health(health) => vec![exported("health", "synpf.Health", stamped(&time, health))],
         Telemetry::Load(load) => vec![exported("load", "synpf.Load", stamped(&time, load))],
         Telemetry::Params(params) => vec![exported("params", "synpf.Params", stamped(&time, params))],
+        Telemetry::Shadow(shadow) => vec![exported("shadow", "synpf.Shadow", stamped(&time, shadow))],
         Telemetry::Event(event) => {
             let time = timestamp(if header.sensor == 0 {
                 header.published

@@ -84,6 +84,11 @@ pub enum ParamsAction {
     },
     /// Answer with all sets.
     List,
+    /// Run a set of the car in the shadow of the one in force, in place of any that does; None ends that.
+    Shadow {
+        /// Its name.
+        name: Option<String>,
+    },
 }
 
 /// About global relocalization.
@@ -138,9 +143,11 @@ impl Message for Command {
         }
         Invalid::unless_at_most("operator", self.operator.len(), Self::MAX_OPERATOR)?;
         match &self.action {
-            Action::Params(ParamsAction::Select { name, .. } | ParamsAction::Delete { name }) => {
-                set_name("name", name)
-            }
+            Action::Params(
+                ParamsAction::Select { name, .. }
+                | ParamsAction::Delete { name }
+                | ParamsAction::Shadow { name: Some(name) },
+            ) => set_name("name", name),
             Action::Params(ParamsAction::Put { set, .. }) => set.validate(),
             Action::Rates(RatesAction::Set(rates)) => [
                 ("pose", rates.pose),

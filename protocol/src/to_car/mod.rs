@@ -2,6 +2,8 @@
 
 mod answer;
 mod command;
+mod link_report;
 
 pub use answer::{Answer, Candidate, Outcome, Reply, StoredSet};
 pub use command::{Action, Command, CommandId, IdError, ParamsAction, Rates, RatesAction, RelocalizeAction};
+pub use link_report::LinkReport;

@@ -150,6 +150,32 @@ pub enum EventKind {
         /// What.
         text: String,
     },
+    /// A set runs in the shadow of the one in force.
+    ShadowStarted {
+        /// That set.
+        set: String,
+    },
+    /// It was ended on request.
+    ShadowEnded {
+        /// That set.
+        set: String,
+    },
+    /// The car has dropped it, because there was not enough CPU for both.
+    ShadowDropped {
+        /// That set.
+        set: String,
+        /// Why, in words with numbers.
+        evidence: String,
+    },
+    /// The link is slow: the car sends less than it was asked for.
+    RatesLowered {
+        /// From publishing a pose to its arrival [s].
+        transit: f32,
+        /// Poses per second now [Hz].
+        pose: f32,
+    },
+    /// The link has recovered: the car sends what it was asked for.
+    RatesRestored,
 }
 
 impl EventKind {
@@ -167,6 +193,8 @@ impl EventKind {
             | Self::SlipStarted { .. }
             | Self::Proposed { .. }
             | Self::CommandRefused { .. }
+            | Self::ShadowDropped { .. }
+            | Self::RatesLowered { .. }
             | Self::Stopping { .. }
             | Self::Warning { .. } => Severity::Warning,
             _ => Severity::Info,
@@ -235,6 +263,14 @@ impl fmt::Display for EventKind {
             Self::CommandRefused { faults } => write!(f, "command refused: {}", faults.join("; ")),
             Self::SourceEnded => f.write_str("end of the sensor data"),
             Self::Warning { text } | Self::Error { text } => f.write_str(text),
+            Self::ShadowStarted { set } => write!(f, "{set} runs in the shadow"),
+            Self::ShadowEnded { set } => write!(f, "{set} no longer runs in the shadow"),
+            Self::ShadowDropped { set, evidence } => write!(f, "shadow {set} dropped: {evidence}"),
+            Self::RatesLowered { transit, pose } => write!(
+                f,
+                "slow link, poses arrive after {transit:.2} s: sends {pose:.0} poses a second and less of the rest"
+            ),
+            Self::RatesRestored => f.write_str("the link has recovered: sends as much as before"),
         }
     }
 }

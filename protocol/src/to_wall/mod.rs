@@ -10,6 +10,7 @@ mod params;
 mod pose;
 mod recorded;
 mod scan_view;
+mod shadow;
 
 pub use cloud::{Cloud, CloudParticle};
 pub use event::{Event, EventKind, SetRef};
@@ -22,3 +23,4 @@ pub use params::{ParameterSet, Params, PendingRevert, Value};
 pub use pose::{Pose, PoseKind, TrackPoint};
 pub use recorded::{RecordedOdometry, RecordedScan, Truth};
 pub use scan_view::{EndPoint, EndPointKind, ScanView};
+pub use shadow::{Comparison, Fitness, Shadow};

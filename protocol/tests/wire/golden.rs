@@ -45,7 +45,7 @@ fn header() {
 #[test]
 fn schemas_keep_their_numbers() {
     let ids: Vec<_> = Schema::ALL.iter().map(|&schema| schema as u16).collect();
-    assert_eq!(ids, (1..=16).collect::<Vec<_>>());
+    assert_eq!(ids, (1..=18).collect::<Vec<_>>());
     assert_eq!(Schema::from_id(7), Some(Schema::Event));
     assert_eq!(Schema::from_id(0), None);
 }
@@ -64,12 +64,13 @@ fn variants_keep_their_numbers() {
     assert_eq!(tags(samples::STATES.map(samples::health), 0), count(7));
     assert_eq!(
         tags(samples::event_kinds().into_iter().map(samples::event), 0),
-        count(21)
+        count(26)
     );
     // A command: id 16, operator 8 + 3, revision 1 + 8.
     let commands = || samples::actions().into_iter().map(samples::command);
-    assert_eq!(tags(commands(), 36), [0, 0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4]);
-    assert_eq!(tags(commands().take(6), 40), count(6));
+    assert_eq!(tags(commands(), 36), [0, 0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4, 0]);
+    let about_sets = commands().take(6).chain(commands().skip(12));
+    assert_eq!(tags(about_sets, 40), count(7));
     // An answer: id 16, the outcome, and for Done the update 1 + 8.
     let answers = || samples::outcomes().into_iter().map(samples::answer);
     assert_eq!(tags(answers(), 16), [0, 0, 0, 0, 1, 2]);
@@ -108,5 +109,7 @@ payloads! {
     info: samples::info();
     clock_reply: ClockReply { sent: 1, received: 2, answered: 3 };
     command: samples::command(samples::actions().swap_remove(1));
+    shadow: samples::shadow();
+    link_report: LinkReport { transit: 0.25, uncertainty: 0.125, poses: 40 };
     answer: samples::answer(samples::outcomes().swap_remove(1));
 }

@@ -79,6 +79,7 @@ fn decode_as_all(bytes: &[u8]) {
     drop(decode::<ClockReply>(bytes));
     drop(decode::<Command>(bytes));
     drop(decode::<Answer>(bytes));
+    drop(decode::<LinkReport>(bytes));
 }
 
 #[test]
@@ -89,6 +90,7 @@ fn every_kind_of_message_comes_back() {
     check(&samples::scan_view());
     check(&samples::load());
     check(&samples::params());
+    check(&samples::shadow());
     check(&samples::map());
     check(&samples::info());
     check(&Truth {

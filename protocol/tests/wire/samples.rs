@@ -176,6 +176,45 @@ pub(crate) fn parameter_set() -> ParameterSet {
     }
 }
 
+pub(crate) fn shadow() -> Shadow {
+    let fitness = Fitness {
+        alignment: 0.75,
+        residual: 0.0625,
+        innovation: 0.03125,
+        spread_along: 0.25,
+        spread_across: 0.125,
+        update_us: Latency {
+            p50: 1.0,
+            p99: 2.0,
+            max: 4.0,
+        },
+    };
+    Shadow {
+        set: Some("lq".into()),
+        who: "ana".into(),
+        since: 1_000,
+        comparison: Some(Comparison {
+            in_force: SetRef {
+                name: "hq".into(),
+                revision: 5,
+            },
+            window: 8.0,
+            scans: 320,
+            skipped: 2,
+            force: fitness,
+            shadow: Fitness {
+                alignment: 0.5,
+                ..fitness
+            },
+            distance: 0.0625,
+            distance_max: 0.125,
+            angle: 0.015_625,
+            force_better: 0.5,
+            shadow_better: 0.25,
+        }),
+    }
+}
+
 pub(crate) fn params() -> Params {
     Params {
         set: parameter_set(),
@@ -249,7 +288,18 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
         },
         EventKind::SourceEnded,
         EventKind::Warning { text: text.clone() },
-        EventKind::Error { text },
+        EventKind::Error { text: text.clone() },
+        EventKind::ShadowStarted { set: "lq".into() },
+        EventKind::ShadowEnded { set: "lq".into() },
+        EventKind::ShadowDropped {
+            set: "lq".into(),
+            evidence: text,
+        },
+        EventKind::RatesLowered {
+            transit: 0.5,
+            pose: 20.0,
+        },
+        EventKind::RatesRestored,
     ]
 }
 
@@ -328,6 +378,9 @@ pub(crate) fn actions() -> Vec<Action> {
         Action::Rates(RatesAction::Get),
         Action::Rates(RatesAction::Set(rates)),
         Action::Auto(true),
+        Action::Params(ParamsAction::Shadow {
+            name: Some("lq".into()),
+        }),
     ]
 }
 
@@ -553,6 +606,7 @@ pub(crate) fn any_command() -> impl Strategy<Value = Command> {
         Just(ParamsAction::Revert),
         "[a-z0-9-]{1,64}".prop_map(|name| ParamsAction::Delete { name }),
         Just(ParamsAction::List),
+        option::of("[a-z0-9-]{1,64}").prop_map(|name| ParamsAction::Shadow { name }),
     ];
     let action = prop_oneof![
         params.prop_map(Action::Params),

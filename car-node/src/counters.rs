@@ -21,7 +21,7 @@ pub struct Spread {
 }
 
 impl Spread {
-    fn of(values: &[f64]) -> Self {
+    pub(crate) fn of(values: &[f64]) -> Self {
         let at = |share| percentile(values, share).unwrap_or_default();
         Self {
             p50: at(0.5),

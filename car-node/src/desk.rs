@@ -20,7 +20,7 @@ use protocol::{
     Action, Answer, Candidate, Command, CommandId, EventKind, Outcome, ParamsAction, RatesAction,
     RelocalizeAction, Reply, Stamps, Topic, decode, encode,
 };
-use synpf::{TrackMap, Tuning};
+use synpf::{Localizer, Parameters, TrackMap, Tuning};
 use zenoh::Wait;
 use zenoh::query::Query;
 
@@ -30,6 +30,7 @@ use crate::clock::{SensorClock, wall_now};
 use crate::filter::{Order, Shared};
 use crate::keeper::{Decision, Keeper, Plan, Refusal};
 use crate::outbox::Record;
+use crate::shadow::Wish;
 use crate::wire;
 
 /// The filter looks at orders between two messages; longer than this and it hangs.
@@ -64,6 +65,10 @@ pub struct Desk {
     pub file: Option<StateFile>,
     /// Orders to the filter.
     pub orders: Sender<Order>,
+    /// Wishes to the shadow.
+    pub shadow: Sender<Wish>,
+    /// Where the laser is, for a localizer in the shadow.
+    pub base_link_from_laser: Pose,
     /// What goes out.
     pub shared: Arc<Shared>,
     /// The sensors' time, for events.
@@ -214,6 +219,7 @@ impl Loop {
                 self.tell_params();
                 done(None, Reply::Nothing)
             }
+            Ok(Decision::Shadow(set)) => self.run_in_shadow(command, set),
             Ok(Decision::Deleted(name)) => {
                 self.event(EventKind::SetDeleted { name }, Some(command));
                 self.save();
@@ -262,6 +268,19 @@ impl Loop {
             }
         };
         self.event_by(kind, (!falls_back).then_some(who), command);
+        // A set needs no shadow of itself.
+        let doubled = {
+            let shadow = self
+                .desk
+                .shared
+                .shadow
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner);
+            shadow.as_ref() == Some(&self.desk.keeper.in_force().name)
+        };
+        if doubled {
+            self.end_shadow(who, command);
+        }
         self.save();
         self.tell_params();
         Ok(update)
@@ -275,11 +294,56 @@ impl Loop {
             .map_err(|faults| faults.iter().map(ToString::to_string).collect::<Vec<_>>())?;
         let (answer, answered) = bounded(1);
         let order = Order::SetParameters {
-            name: plan.name.clone(),
+            set: self.desk.keeper.next_reference(&plan.name),
             tuning: Box::new(tuning),
             answer,
         };
         self.order(order, &answered).map_err(|fault| vec![fault])
+    }
+
+    /// Starts a set beside the one in force, or ends it. What takes time, its tables, is made ready here.
+    fn run_in_shadow(&mut self, command: &Command, set: Option<(String, Box<Parameters>)>) -> Outcome {
+        let who = command.operator.clone();
+        let Some((name, parameters)) = set else {
+            return if self.end_shadow(&who, Some(command.id)) {
+                done(None, Reply::Nothing)
+            } else {
+                refused("no set runs in the shadow".into())
+            };
+        };
+        self.desk.track_map.prepare(self.believed(), &parameters);
+        let localizer = Localizer::new(
+            Arc::clone(&self.desk.track_map),
+            self.desk.base_link_from_laser,
+            *parameters,
+            SHADOW_SEED,
+        );
+        let localizer = match localizer {
+            Ok(localizer) => Box::new(localizer),
+            Err(fault) => return refused(fault.to_string()),
+        };
+        let wish = Wish::Run {
+            name: name.clone(),
+            who,
+            localizer,
+        };
+        if self.desk.shadow.send(wish).is_err() {
+            return refused("the shadow's thread is gone".into());
+        }
+        self.desk.shared.set_shadow(Some(name.clone()));
+        self.event(EventKind::ShadowStarted { set: name }, Some(command));
+        done(None, Reply::Nothing)
+    }
+
+    /// Ends the set in the shadow; false when there is none.
+    fn end_shadow(&self, who: &str, command: Option<CommandId>) -> bool {
+        let Some(set) = self.desk.shared.set_shadow(None) else {
+            return false;
+        };
+        // The thread lives as long as this one.
+        self.desk.shadow.send(Wish::End { who: who.into() }).ok();
+        self.event_by(EventKind::ShadowEnded { set }, Some(who), command);
+        true
     }
 
     /// Where the car believes to be.
@@ -488,6 +552,9 @@ impl Loop {
         })
     }
 }
+
+/// The shadow's random numbers are its own, and the same in every run.
+const SHADOW_SEED: u64 = 1;
 
 /// Who puts a set back in force when nobody confirmed.
 const FALL_BACK: &str = "fall-back";

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
-use protocol::{CommandId, EventKind, Rates};
+use protocol::{CommandId, EventKind, Rates, SetRef};
 use synpf::{Hypothesis, Localizer, Odometry, Scan, Stamp, Tuning, Update, WeightedPose};
 
 use crate::bag::SensorEvent;
@@ -17,6 +17,7 @@ use crate::health::{Monitor, SlipEvent, SlipTracker, State};
 use crate::laps::LapCounter;
 use crate::outbox::{CloudSample, Fit, Happening, HealthReport, Outbox, PoseEstimate, Record, ScanPoints};
 use crate::proposal::{Advisor, Proposal};
+use crate::shadow::{Note, Sample, Tap};
 use crate::source::{Belief, Feed, SharedBelief};
 use crate::wire;
 
@@ -25,8 +26,8 @@ use crate::wire;
 pub enum Order {
     /// Swap the parameter set.
     SetParameters {
-        /// The set's name, for proposals and laps.
-        name: String,
+        /// The set, for proposals, laps and the shadow.
+        set: SetRef,
         /// The set, made ready.
         tuning: Box<Tuning>,
         /// Where the answer goes.
@@ -71,6 +72,8 @@ pub struct Shared {
     pub advice: Mutex<Advice>,
     /// What the car believes, for a simulated driver.
     pub belief: SharedBelief,
+    /// Name of the set in the shadow: the desk begins it, the shadow's thread may drop it.
+    pub shadow: Mutex<Option<String>>,
 }
 
 impl Default for Shared {
@@ -81,6 +84,7 @@ impl Default for Shared {
             rates: Mutex::new(DEFAULT_RATES),
             advice: Mutex::default(),
             belief: SharedBelief::default(),
+            shadow: Mutex::default(),
         }
     }
 }
@@ -104,6 +108,12 @@ pub struct Advice {
 }
 
 impl Shared {
+    /// Notes which set runs in the shadow; returns the one before it.
+    pub fn set_shadow(&self, name: Option<String>) -> Option<String> {
+        let mut shadow = self.shadow.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut *shadow, name)
+    }
+
     /// Leaves an event.
     pub fn event(
         &self,
@@ -136,12 +146,14 @@ pub struct Filter {
     pub raceline: Option<Arc<Raceline>>,
     /// The sensors' time.
     pub clock: SensorClock,
-    /// Name of the set in force.
-    pub set: String,
+    /// The set in force.
+    pub set: SetRef,
     /// Send a pose with every odometry message, predicted, and not only with every scan.
     pub predict: bool,
     /// Where everything goes.
     pub shared: Arc<Shared>,
+    /// What was taken, for a set in the shadow.
+    pub tap: Tap,
 }
 
 /// What happens at its own pace, on the sensors' clock.
@@ -265,9 +277,9 @@ impl Loop {
         let now = self.now();
         // An answer that nobody waits for any more is nobody's loss.
         match order {
-            Order::SetParameters { name, tuning, answer } => {
+            Order::SetParameters { set, tuning, answer } => {
                 self.filter.localizer.tune(*tuning);
-                self.filter.set = name;
+                self.filter.set = set;
                 answer.send(next).ok();
             }
             Order::Initialize { pose, answer } => {
@@ -302,6 +314,7 @@ impl Loop {
         let now = self.now();
         self.filter.monitor.on_new_pose(now);
         self.laps.on_new_pose();
+        self.hand_on(|| Note::Placed);
         Ok(())
     }
 
@@ -343,8 +356,11 @@ impl Loop {
         counters.arrived(&event, now.since(stamp), now.0 as f64 * 1e-9, queued);
         let result = match event {
             SensorEvent::Odometry(odometry) => self.on_odometry(odometry, now),
-            SensorEvent::YawRate(yaw_rate) => self.filter.localizer.on_yaw_rate(&yaw_rate),
-            SensorEvent::Scan(scan) => self.on_scan(scan),
+            SensorEvent::YawRate(yaw_rate) => {
+                self.hand_on(|| Note::YawRate(yaw_rate));
+                self.filter.localizer.on_yaw_rate(&yaw_rate)
+            }
+            SensorEvent::Scan(scan) => self.on_scan(scan, queued),
         };
         if let Err(cause) = result {
             counters.dropped(cause);
@@ -361,6 +377,7 @@ impl Loop {
 
     fn on_odometry(&mut self, odometry: Odometry, now: Stamp) -> Result<(), synpf::Dropped> {
         self.filter.localizer.on_odometry(&odometry)?;
+        self.hand_on(|| Note::Odometry(odometry));
         self.filter.monitor.on_odometry(now);
         self.last_odometry = Some(odometry.pose);
         if self.rates().recorded {
@@ -384,7 +401,14 @@ impl Loop {
         Ok(())
     }
 
-    fn on_scan(&mut self, scan: Scan) -> Result<(), synpf::Dropped> {
+    /// For the shadow, if there is one.
+    fn hand_on(&self, note: impl FnOnce() -> Note) {
+        if self.filter.tap.wanted() {
+            self.filter.tap.hand_on(note());
+        }
+    }
+
+    fn on_scan(&mut self, scan: Scan, queued: usize) -> Result<(), synpf::Dropped> {
         let before = Instant::now();
         let result = self.filter.localizer.on_scan(&scan);
         let taken = before.elapsed().as_secs_f64();
@@ -424,6 +448,15 @@ impl Loop {
         if self.paces.scan.due(update.stamp, rates.scan) {
             shared.outbox.scan(self.scan_points(&update, &scan));
         }
+        self.hand_on(|| {
+            Note::Scan(Box::new(Sample {
+                scan: scan.clone(),
+                update: update.clone(),
+                taken,
+                queued,
+                set: self.filter.set.clone(),
+            }))
+        });
         if rates.recorded {
             shared.outbox.record(Record::Scan(scan));
         }
@@ -467,7 +500,7 @@ impl Loop {
             self.event(EventKind::Lap {
                 lap: crossing.ended,
                 time: crossing.time,
-                set: self.filter.set.clone(),
+                set: self.filter.set.name.clone(),
             });
         }
     }
@@ -483,7 +516,7 @@ impl Loop {
             None => {}
         }
         self.advisor.on_update(update, &thresholds);
-        let proposal = self.advisor.proposal(&self.filter.set).cloned();
+        let proposal = self.advisor.proposal(&self.filter.set.name).cloned();
         let mut advice = self
             .filter
             .shared

@@ -81,6 +81,8 @@ pub enum Decision {
     Deleted(String),
     /// All sets.
     Sets(Vec<StoredSet>),
+    /// Run this set in the shadow, or none.
+    Shadow(Option<(String, Box<Parameters>)>),
 }
 
 /// Why not.
@@ -143,6 +145,14 @@ impl Keeper {
         SetRef {
             name: self.in_force.name.clone(),
             revision: self.memory.revision,
+        }
+    }
+
+    /// What a set of this name will be called once it is in force.
+    pub fn next_reference(&self, name: &str) -> SetRef {
+        SetRef {
+            name: name.into(),
+            revision: self.memory.revision + 1,
         }
     }
 
@@ -234,7 +244,14 @@ impl Keeper {
                 }
             }
             ParamsAction::List => Ok(Decision::Sets(self.list())),
-            ParamsAction::Shadow { .. } => Err(fault("no set can run in the shadow on this car yet".into())),
+            ParamsAction::Shadow { name: None } => Ok(Decision::Shadow(None)),
+            ParamsAction::Shadow { name: Some(name) } => {
+                if *name == self.in_force.name {
+                    return Err(fault(format!("{name} is in force: nothing to compare it with")));
+                }
+                let parameters = self.find(name).ok_or_else(|| fault(self.no_such_set(name)))?;
+                Ok(Decision::Shadow(Some((name.clone(), Box::new(parameters)))))
+            }
         }
     }
 

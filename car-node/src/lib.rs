@@ -20,5 +20,6 @@ pub mod publisher;
 pub mod race;
 pub mod ros;
 pub mod sets;
+pub mod shadow;
 pub mod source;
 pub mod wire;

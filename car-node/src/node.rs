@@ -30,6 +30,7 @@ use crate::link::{self, LinkError};
 use crate::load;
 use crate::publisher::Publisher;
 use crate::sets::{self, NamedSet, SetError};
+use crate::shadow;
 use crate::source::{self, Source};
 use crate::wire;
 
@@ -146,6 +147,7 @@ pub struct Node {
     filter: JoinHandle<()>,
     desk: JoinHandle<()>,
     load: JoinHandle<()>,
+    shadow: JoinHandle<()>,
     publisher: JoinHandle<()>,
     queryables: Vec<Queryable<()>>,
     alive: LivelinessToken,
@@ -215,6 +217,9 @@ impl Node {
         let (feed, fed) = bounded(source::QUEUE);
         let (orders, ordered) = bounded(QUEUE);
         let (inquiries, inquired) = bounded(QUEUE);
+        let (wishes, wished) = bounded(QUEUE);
+        let (tap, tapped) = shadow::tap();
+        let keeper = Keeper::new(memory, set.name, set.parameters, started);
 
         shared.event(
             clock.now(),
@@ -239,18 +244,22 @@ impl Node {
                 base_link_from_laser: mount.base_link_from_laser,
                 raceline: map.raceline,
                 clock,
-                set: set.name.clone(),
+                set: keeper.reference(),
                 predict,
                 shared: Arc::clone(&shared),
+                tap,
             },
             fed,
             ordered,
         )?;
+        let shadow = shadow::start(tapped, wished, Arc::clone(&shared), clock)?;
         let desk = desk::start(
             Desk {
-                keeper: Keeper::new(memory, set.name, set.parameters, started),
+                keeper,
                 file,
                 orders,
+                shadow: wishes,
+                base_link_from_laser: mount.base_link_from_laser,
                 shared: Arc::clone(&shared),
                 clock,
                 session_number,
@@ -284,6 +293,7 @@ impl Node {
             filter,
             desk,
             load,
+            shadow,
             publisher,
             queryables,
             alive,
@@ -319,6 +329,7 @@ impl Node {
         // The desk held the only way to give orders.
         join(self.filter);
         join(self.load);
+        join(self.shadow);
         drop(self.stop_publisher);
         join(self.publisher);
         drop(self.queryables);

@@ -142,6 +142,8 @@ pub enum Record {
     Truth(TrueMotion),
     /// The set in force.
     Params(Box<protocol::Params>),
+    /// The set in the shadow and how it compares.
+    Shadow(Box<protocol::Shadow>),
     /// Load of the last second.
     Load(Box<protocol::Load>),
     /// An event.

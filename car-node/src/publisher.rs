@@ -17,13 +17,14 @@ use crate::outbox::Record;
 use crate::wire;
 
 /// Everything that goes out.
-pub const TOPICS: [Topic; 12] = [
+pub const TOPICS: [Topic; 13] = [
     Topic::Pose,
     Topic::Cloud,
     Topic::Scan,
     Topic::Health,
     Topic::Load,
     Topic::Params,
+    Topic::Shadow,
     Topic::Event,
     Topic::RecordedPose,
     Topic::RecordedHealth,
@@ -149,6 +150,7 @@ impl Publisher {
                 &wire::truth(&truth),
             ),
             Record::Params(params) => self.send(Topic::Params, wall_now(), params.as_ref()),
+            Record::Shadow(shadow) => self.send(Topic::Shadow, wall_now(), shadow.as_ref()),
             Record::Load(load) => self.send(Topic::Load, wall_now(), load.as_ref()),
             Record::Event(event) => self.send(
                 Topic::Event,

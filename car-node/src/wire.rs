@@ -15,13 +15,13 @@ use crate::outbox::{CloudSample, Fit, HealthReport, PoseEstimate, ScanPoints, Tr
 
 /// What is not finite has no place on the wire; such a number becomes 0, having been counted as bad where it
 /// arose.
-fn finite(value: f64) -> f32 {
+pub(crate) fn finite(value: f64) -> f32 {
     let value = value as f32;
     if value.is_finite() { value } else { 0.0 }
 }
 
 /// A share in [0, 1].
-fn share(value: f64) -> f32 {
+pub(crate) fn share(value: f64) -> f32 {
     finite(value).clamp(0.0, 1.0)
 }
 

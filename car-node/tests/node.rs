@@ -9,8 +9,8 @@ use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::source::Race;
 use protocol::{
     Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, Message, Outcome,
-    ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Stamps, State, Topic, Value, decode,
-    encode,
+    ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Shadow, Stamps, State, Topic, Value,
+    decode, encode,
 };
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;
@@ -411,4 +411,80 @@ fn client_of_nobody() -> Config {
         config.insert_json5(key, value).expect("a setting");
     }
     config
+}
+
+fn shadow(name: Option<&str>) -> Action {
+    Action::Params(ParamsAction::Shadow {
+        name: name.map(str::to_owned),
+    })
+}
+
+#[test]
+fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
+    let wall = Wall::open();
+    let (node, car) = start_and_wait("foxtrot", &wall, |_| ());
+    let shadows = wall.subscribe(&car, Topic::Shadow);
+    let events = wall.subscribe(&car, Topic::Event);
+    let poses = wall.subscribe(&car, Topic::RecordedPose);
+    next::<Pose>(&poses, |pose| pose.update > 5);
+
+    for (id, name, word) in [
+        (1, Some("wet"), "no set"),
+        (2, Some("hq"), "in force"),
+        (3, None, "no set"),
+    ] {
+        let answer = wall.command(&car, id, None, shadow(name));
+        let Outcome::Refused { faults } = answer.outcome else {
+            panic!("{answer:?}");
+        };
+        assert!(faults[0].contains(word), "{faults:?}");
+    }
+    let mut id = 10;
+    let mut begin = || {
+        id += 1;
+        let answer = wall.command(&car, id, None, shadow(Some("lq")));
+        assert!(matches!(answer.outcome, Outcome::Done { .. }), "{answer:?}");
+        assert_eq!(answer.set.name, "hq", "nothing else is in force");
+    };
+    begin();
+    next::<Event>(&events, |event| {
+        event.kind == EventKind::ShadowStarted { set: "lq".into() }
+    });
+    // A busy machine may drop the shadow, as it should: then it is asked for again.
+    let comparison = loop {
+        let (_, told) = next::<Shadow>(&shadows, |shadow| {
+            shadow.who == "load" || shadow.comparison.as_ref().is_some_and(|c| c.scans >= 40)
+        });
+        match told.comparison {
+            Some(comparison) => break comparison,
+            None => begin(),
+        }
+    };
+    assert_eq!(comparison.in_force.name, "hq");
+    assert!(
+        comparison.force.alignment > 0.7 && comparison.shadow.alignment > 0.7,
+        "{comparison:?}"
+    );
+    assert!(
+        comparison.distance < 0.1 && comparison.distance > 0.0,
+        "{comparison:?}"
+    );
+    assert!(comparison.shadow.update_us.p50 > 0.0);
+    assert!(comparison.force_better + comparison.shadow_better <= 1.0);
+
+    wall.command(&car, 100, None, select("lq", None));
+    next::<Event>(
+        &events,
+        |event| matches!(&event.kind, EventKind::ShadowEnded { set } | EventKind::ShadowDropped { set, .. } if set == "lq"),
+    );
+    let (_, told) = next::<Shadow>(&shadows, |shadow| shadow.set.is_none());
+    assert_eq!(told.comparison, None);
+    node.shutdown("test over");
+    // The set in force has missed nothing.
+    let mut last = None;
+    while let Ok(Some(sample)) = poses.try_recv() {
+        let (_, pose) = decode::<Pose>(&sample.payload().to_bytes()).expect("a pose");
+        assert!(last.is_none_or(|last| pose.update == last + 1));
+        last = Some(pose.update);
+    }
 }

@@ -9,6 +9,8 @@ use protocol::{
 };
 use serde::Serialize;
 
+use crate::history::{History, Moment, Place, Strip};
+use crate::laps::{Lap, LapBook, Passed};
 use crate::stream::{Stream, StreamView};
 
 /// A car as the pit wall sees it.
@@ -44,21 +46,11 @@ pub struct Car {
     pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
     /// What runs on it.
     pub info: Option<CarInfo>,
-    /// Laps driven, the last [`Car::MAX_LAPS`].
-    pub laps: Vec<Lap>,
+    laps: LapBook,
+    history: History,
+    strip: Strip,
     clock: Option<ClockEstimate>,
     streams: BTreeMap<Topic, Stream>,
-}
-
-/// A lap that was driven.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Lap {
-    /// Its number, from 1.
-    pub lap: u32,
-    /// Its time [s].
-    pub time_s: f64,
-    /// The set in force at its end.
-    pub set: String,
 }
 
 /// How far the car's clock is ahead of the laptop's.
@@ -75,8 +67,6 @@ impl ClockEstimate {
 }
 
 impl Car {
-    /// Most laps kept.
-    pub const MAX_LAPS: usize = 500;
     /// A car not heard of for this long is out of sight [ns].
     pub const BLIND_AFTER: i64 = 1_000_000_000;
 
@@ -98,7 +88,9 @@ impl Car {
             truth: None,
             map: None,
             info: None,
-            laps: Vec::new(),
+            laps: LapBook::default(),
+            history: History::default(),
+            strip: Strip::default(),
             clock: None,
             streams: BTreeMap::new(),
         }
@@ -114,10 +106,31 @@ impl Car {
         match telemetry {
             // The full-rate pose is the same pose again, held back until gaps are filled: not for display.
             Telemetry::Pose(_) | Telemetry::Health(_) if topic.recorded() => {}
-            Telemetry::Pose(pose) => self.pose = Some((*header, *pose)),
+            Telemetry::Pose(pose) => {
+                self.pose = Some((*header, *pose));
+                if let (Some(track), Some(length)) = (pose.track, self.lap_length()) {
+                    let here = Passed {
+                        at: header.sensor,
+                        s: track.s,
+                        d: track.d,
+                        lap: pose.lap,
+                    };
+                    self.laps.on_pose(here, length);
+                }
+            }
             Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
             Telemetry::Scan(scan) => self.scan = Some(scan.clone()),
-            Telemetry::Health(health) => self.health = Some(health.clone()),
+            Telemetry::Health(health) => {
+                self.history.take(at, health);
+                if let Some(metrics) = &health.metrics {
+                    self.laps.on_metrics(metrics);
+                }
+                let s = self.pose.and_then(|(_, pose)| Some(pose.track?.s));
+                if let (Some(s), Some(length)) = (s, self.lap_length()) {
+                    self.strip.take(s, length, health);
+                }
+                self.health = Some(health.clone());
+            }
             Telemetry::Load(load) => self.load = Some(load.clone()),
             Telemetry::Params(params) => self.params = Some(params.clone()),
             Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
@@ -129,19 +142,36 @@ impl Car {
                     set,
                 } = &event.kind
                 {
-                    if self.laps.len() == Self::MAX_LAPS {
-                        self.laps.remove(0);
-                    }
-                    self.laps.push(Lap {
-                        lap: *lap,
-                        time_s: *time,
-                        set: set.clone(),
-                    });
+                    self.laps.on_lap(*lap, *time, set);
                 }
             }
             Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
         }
         true
+    }
+
+    /// Laps driven, the last 500.
+    pub fn laps(&self) -> &[Lap] {
+        self.laps.laps()
+    }
+
+    /// The last two minutes of health, the oldest first.
+    pub fn history(&self) -> impl Iterator<Item = &Moment> {
+        self.history.moments()
+    }
+
+    /// Health along the lap, the last time the car was there: places of equal length from the start line on. Empty
+    /// without a raceline.
+    pub fn strip(&self) -> &[Option<Place>] {
+        self.strip.places()
+    }
+
+    /// Length of a lap [m]; None without a raceline.
+    pub fn lap_length(&self) -> Option<f64> {
+        let map = self.map.as_ref().and_then(|(map, _)| map.raceline.as_ref());
+        map.map(|raceline| raceline.length)
+            .or_else(|| self.info.as_ref().and_then(|info| info.lap_length))
+            .filter(|length| *length > 0.0)
     }
 
     /// Takes note of bytes that could not be read. True for the first of their topic.
@@ -196,7 +226,7 @@ impl Car {
                 health.causes.iter().map(ToString::to_string).collect(),
             ),
         };
-        let best = self.laps.iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
+        let best = self.laps().iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
         CarView {
             car: self.name.clone(),
             state,
@@ -242,7 +272,7 @@ impl Car {
                 .iter()
                 .map(|(topic, stream)| (topic.as_str(), stream.view(now, offset)))
                 .collect(),
-            last_lap_s: self.laps.last().map(|lap| lap.time_s),
+            last_lap_s: self.laps().last().map(|lap| lap.time_s),
             best_lap_s: best,
             info: self.info.clone(),
         }

@@ -25,7 +25,12 @@ pub(crate) struct Cli {
 #[derive(Debug, Args)]
 pub(crate) struct Page {
     /// Where the page is served. On any but a loopback address it asks for the token that is printed.
-    #[arg(long = "page", value_name = "ADDRESS:PORT", default_value = "127.0.0.1:7448")]
+    #[arg(
+        long = "page",
+        global = true,
+        value_name = "ADDRESS:PORT",
+        default_value = "127.0.0.1:7448"
+    )]
     pub(crate) address: SocketAddr,
     /// The folder that recordings started from the page go to.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
@@ -133,6 +138,17 @@ pub(crate) enum Verb {
         /// Stop after this time.
         #[arg(long = "for", value_name = "TIME", value_parser = duration)]
         time: Option<Duration>,
+    },
+    /// Serve the page from a recording, as if the cars were there.
+    Replay {
+        /// The recording.
+        file: PathBuf,
+        /// Times real time, 0.1 to 50.
+        #[arg(long, default_value_t = 1.0)]
+        speed: f64,
+        /// Begin here, as 90s or 5m.
+        #[arg(long, value_name = "TIME", default_value = "0s", value_parser = duration)]
+        at: Duration,
     },
     /// Repair a recording that was cut off.
     Recover {

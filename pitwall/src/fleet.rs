@@ -105,6 +105,27 @@ impl Fleet {
         });
     }
 
+    /// Takes note that somebody has seen every alarm so far; says so if there was one.
+    pub fn acknowledge(&mut self, at: i64, who: &str) {
+        let alarms = self.log.acknowledge();
+        if alarms > 0 {
+            let alarms = if alarms == 1 {
+                "1 alarm".to_owned()
+            } else {
+                format!("{alarms} alarms")
+            };
+            let text = format!("{alarms} acknowledged");
+            self.say(
+                at,
+                None,
+                Severity::Info,
+                "acknowledged",
+                text,
+                Some(who.to_owned()),
+            );
+        }
+    }
+
     /// The cars by name.
     pub fn cars(&self) -> impl Iterator<Item = &Car> {
         self.cars.values()
@@ -316,6 +337,29 @@ mod tests {
     }
 
     #[test]
+    fn an_alarm_stays_until_it_is_acknowledged() {
+        let mut fleet = Fleet::default();
+        fleet.say(1, None, Severity::Critical, "link", "BLIND".into(), None);
+        fleet.say(2, None, Severity::Warning, "link", "slow".into(), None);
+        assert_eq!(fleet.log().alarms(), 1);
+        fleet.acknowledge(3, "ana");
+        fleet.acknowledge(4, "ben");
+        assert_eq!(fleet.log().alarms(), 0);
+        let said: Vec<_> = fleet
+            .log()
+            .since(2)
+            .map(|entry| (entry.text.as_str(), entry.who.as_deref()))
+            .collect();
+        assert_eq!(
+            said,
+            [("1 alarm acknowledged", Some("ana"))],
+            "nothing is acknowledged twice"
+        );
+        fleet.say(5, None, Severity::Critical, "link", "BLIND".into(), None);
+        assert_eq!(fleet.log().alarms(), 1);
+    }
+
+    #[test]
     fn laps_are_counted_once() {
         let mut fleet = Fleet::default();
         let lap = || {
@@ -332,7 +376,7 @@ mod tests {
         };
         fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
         fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
-        assert_eq!(fleet.car(&name()).map(|car| car.laps.len()), Some(1));
+        assert_eq!(fleet.car(&name()).map(|car| car.laps().len()), Some(1));
         assert_eq!(fleet.log().since(0).count(), 1);
     }
 }

@@ -1,13 +1,14 @@
 //! The running pit wall: a link whose events keep a fleet up to date and, when asked, fill a recording.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, Sender, TrySendError};
+use crossbeam_channel::Receiver;
 use protocol::CarName;
 use tokio::task::JoinHandle;
 
+use crate::board::{Board, FleetGuard};
 use crate::event::{FleetEvent, Happening};
 use crate::fleet::Fleet;
 use crate::link::{Link, LinkError, Role, unix_now};
@@ -16,35 +17,8 @@ use crate::recording::{Recorder, RecordingError, Status, Summary};
 /// A pit wall at work. Cheap to share.
 pub struct Hub {
     link: Link,
-    shared: Arc<Shared>,
+    board: Arc<Board>,
     housekeeping: Mutex<Option<JoinHandle<()>>>,
-}
-
-#[derive(Default)]
-struct Shared {
-    fleet: Mutex<Fleet>,
-    recorder: Mutex<Option<Recorder>>,
-    taps: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
-}
-
-impl Shared {
-    fn fleet(&self) -> MutexGuard<'_, Fleet> {
-        self.fleet.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn recorder(&self) -> MutexGuard<'_, Option<Recorder>> {
-        self.recorder.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn take(&self, event: FleetEvent) {
-        self.fleet().apply(&event);
-        let event = Arc::new(event);
-        if let Some(recorder) = &*self.recorder() {
-            recorder.take(&event);
-        }
-        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
-        taps.retain(|tap| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))));
-    }
 }
 
 impl Hub {
@@ -57,12 +31,12 @@ impl Hub {
 
     /// Opens the link. Needs a multi-thread tokio runtime.
     pub async fn open(role: &Role) -> Result<Arc<Self>, LinkError> {
-        let shared = Arc::new(Shared::default());
-        let sink = shared.clone();
+        let board = Arc::new(Board::default());
+        let sink = board.clone();
         let link = Link::open(role, Arc::new(move |event| sink.take(event))).await?;
         let hub = Arc::new(Self {
             link,
-            shared,
+            board,
             housekeeping: Mutex::default(),
         });
         let task = tokio::spawn(keep_house(Arc::downgrade(&hub)));
@@ -76,23 +50,18 @@ impl Hub {
     }
 
     /// What is known. Hold it briefly: what comes in meanwhile waits.
-    pub fn fleet(&self) -> MutexGuard<'_, Fleet> {
-        self.shared.fleet()
+    pub fn fleet(&self) -> FleetGuard<'_> {
+        self.board.fleet()
+    }
+
+    /// Where events arrive.
+    pub fn board(&self) -> &Arc<Board> {
+        &self.board
     }
 
     /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
     pub fn tap(&self) -> Receiver<Arc<FleetEvent>> {
-        const WAITING: usize = 20_000;
-        let (tap, events) = crossbeam_channel::bounded(WAITING);
-        for event in self.known() {
-            drop(tap.try_send(Arc::new(event)));
-        }
-        self.shared
-            .taps
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(tap);
-        events
+        self.board.tap(unix_now())
     }
 
     /// Waits until a car is there; false when it is not within `patience`.
@@ -117,14 +86,14 @@ impl Hub {
 
     /// Begins a recording of all cars. What is known already of map, set in force and clock goes in first.
     pub async fn start_recording(&self, path: &Path) -> Result<(), StartError> {
-        if self.shared.recorder().is_some() {
+        if self.board.recorder().is_some() {
             return Err(StartError::Recording);
         }
         let recorder = Recorder::start(path)?;
-        for event in self.known() {
+        for event in self.board.known(unix_now()) {
             recorder.take(&Arc::new(event));
         }
-        *self.shared.recorder() = Some(recorder);
+        *self.board.recorder() = Some(recorder);
         self.link.subscribe_recorded(true).await?;
         Ok(())
     }
@@ -139,7 +108,7 @@ impl Hub {
         {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
-        let recorder = self.shared.recorder().take()?;
+        let recorder = self.board.recorder().take()?;
         if let Err(error) = self.link.subscribe_recorded(false).await {
             tracing::warn!(%error, "still subscribed to the full-rate streams");
         }
@@ -148,12 +117,12 @@ impl Hub {
 
     /// How the recording is getting on; None when there is none.
     pub fn recording(&self) -> Option<Status> {
-        self.shared.recorder().as_ref().map(Recorder::status)
+        self.board.recorder().as_ref().map(Recorder::status)
     }
 
     /// The file that is being recorded into.
     pub fn recording_path(&self) -> Option<PathBuf> {
-        let recorder = self.shared.recorder();
+        let recorder = self.board.recorder();
         recorder.as_ref().map(|recorder| recorder.path().to_owned())
     }
 
@@ -182,38 +151,6 @@ impl Hub {
             tracing::error!(%error, "the recording is damaged");
         }
         self.link.close().await;
-    }
-
-    /// What a recording that begins now would otherwise not know.
-    fn known(&self) -> Vec<FleetEvent> {
-        let at = unix_now();
-        let fleet = self.fleet();
-        let mut events = Vec::new();
-        for car in fleet.cars() {
-            let mut push = |happening| {
-                events.push(FleetEvent {
-                    at,
-                    car: car.name.clone(),
-                    happening,
-                });
-            };
-            if car.alive {
-                push(Happening::Appeared);
-            }
-            if let Some((map, bytes)) = &car.map {
-                push(Happening::Map {
-                    map: map.clone(),
-                    bytes: bytes.clone(),
-                });
-            }
-            if let Some(info) = &car.info {
-                push(Happening::Info(info.clone()));
-            }
-            if let Some((offset, round_trip)) = car.clock() {
-                push(Happening::Clock { offset, round_trip });
-            }
-        }
-        events
     }
 }
 

@@ -8,14 +8,18 @@
 //! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Link`] is the
 //! only way to the network.
 mod ask;
+mod board;
 mod car;
 mod event;
 mod fleet;
 mod gaps;
+mod history;
 mod hub;
+mod laps;
 mod link;
 mod log;
 mod recording;
+mod replay;
 #[cfg(feature = "rerun")]
 mod rerun_view;
 mod stream;
@@ -23,16 +27,21 @@ mod wall;
 mod web;
 
 pub use ask::{PATIENCE, Verdict, new_command_id};
-pub use car::{Car, CarView, Lap, PoseView, SetView};
+pub use board::{Board, FleetGuard};
+pub use car::{Car, CarView, PoseView, SetView};
 pub use event::{FleetEvent, Happening, Lane};
 pub use fleet::Fleet;
 pub use gaps::{Arrival, GapSummary, Gaps};
+pub use history::{Moment, Place};
 pub use hub::{Hub, StartError};
+pub use laps::{Lap, LapGrip, SECTORS};
 pub use link::{DEFAULT_LISTEN, LOCAL_WALL, Link, LinkError, Role, Sink, unix_now};
 pub use log::{Log, LogEntry};
 pub use recording::{
-    Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events, recover,
+    Progress, Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events,
+    recover,
 };
+pub use replay::{Replay, ReplayView};
 #[cfg(feature = "rerun")]
 pub use rerun_view::{RerunError, RerunOutlet, RerunView};
 pub use stream::{Stream, StreamView};

@@ -29,6 +29,8 @@ pub struct LogEntry {
 pub struct Log {
     entries: VecDeque<LogEntry>,
     count: u64,
+    /// Alarms up to this line have been seen.
+    acknowledged: u64,
 }
 
 impl Log {
@@ -48,6 +50,25 @@ impl Log {
     pub fn since(&self, after: u64) -> impl Iterator<Item = &LogEntry> {
         let skip = self.entries.partition_point(|entry| entry.number <= after);
         self.entries.iter().skip(skip)
+    }
+
+    /// Critical lines that nobody has acknowledged.
+    pub fn alarms(&self) -> usize {
+        self.since(self.acknowledged)
+            .filter(|entry| entry.severity == Severity::Critical)
+            .count()
+    }
+
+    /// The number of the last line that was acknowledged; 0 for none.
+    pub fn acknowledged(&self) -> u64 {
+        self.acknowledged
+    }
+
+    /// Takes every line so far as seen; returns how many of them were open alarms.
+    pub(crate) fn acknowledge(&mut self) -> usize {
+        let alarms = self.alarms();
+        self.acknowledged = self.count;
+        alarms
     }
 
     /// The number of the last line; 0 for none.

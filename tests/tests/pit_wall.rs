@@ -157,8 +157,11 @@ async fn a_recording_of_three_cars_holds_every_message() {
         cars.push(FakeCar::start(name, &endpoint, Behaviour::default()).await);
     }
     wait_until("two laps", || {
-        cars.iter()
-            .all(|car| hub.fleet().car(car.name()).is_some_and(|car| car.laps.len() >= 2))
+        cars.iter().all(|car| {
+            hub.fleet()
+                .car(car.name())
+                .is_some_and(|car| car.laps().len() >= 2)
+        })
     })
     .await;
     let mut published = BTreeMap::new();

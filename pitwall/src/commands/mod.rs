@@ -4,6 +4,7 @@ mod cars;
 mod events;
 mod params;
 mod record;
+mod replay;
 mod serve;
 mod steer;
 mod watch;
@@ -12,7 +13,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pitwall::{Hub, Role};
+use pitwall::{Hub, PageOptions, Role};
 use protocol::CarName;
 
 use crate::cli::{Cli, LinkOptions, Verb};
@@ -44,6 +45,13 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Auto { car, on } => steer::auto(&link, &car, on, json).await,
         Verb::Events { car, follow } => events::run(&link, car, follow, json).await,
         Verb::Record { output, time } => record::record(&link, &output, time, json).await,
+        Verb::Replay { file, speed, at } => {
+            let options = PageOptions {
+                address: page.address,
+                recordings: page.recordings,
+            };
+            replay::run(&file, options, speed, at.as_secs_f64(), json).await
+        }
         Verb::Recover { file, output } => record::recover(&file, output, json),
     }
 }

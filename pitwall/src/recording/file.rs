@@ -296,6 +296,9 @@ pub enum RecordingError {
         /// What is wrong.
         source: mcap::McapError,
     },
+    /// The file is a recording of nothing.
+    #[error("{0} holds no event of any car")]
+    Empty(String),
     /// A message in the file cannot be read.
     #[error("{file}: {channel} number {sequence}: {reason}")]
     Message {
@@ -311,7 +314,7 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
-    pub(super) fn io(file: &std::path::Path, source: std::io::Error) -> Self {
+    pub(crate) fn io(file: &std::path::Path, source: std::io::Error) -> Self {
         let file = file.display().to_string();
         if source.kind() == std::io::ErrorKind::AlreadyExists {
             Self::Exists(file)

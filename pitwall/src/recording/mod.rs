@@ -26,5 +26,5 @@ mod recover;
 
 pub use file::{RecordingError, StreamSummary, Summary};
 pub use read::{Recording, read_events};
-pub use recorder::{Recorder, Status};
+pub use recorder::{Progress, Recorder, Status};
 pub use recover::{Recovered, recover};

@@ -4,7 +4,7 @@ use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
-use protocol::{Action, CarName, Command, CommandId};
+use protocol::{Action, CarName, Command, CommandId, Severity};
 use serde::Deserialize;
 use serde_json::json;
 
@@ -14,7 +14,7 @@ use crate::link::unix_now;
 
 /// The map of a car.
 pub(super) async fn map(State(app): State<App>, Path(car): Path<CarName>) -> Response {
-    let map = app.hub.fleet().car(&car).and_then(|car| car.map.clone());
+    let map = app.board.fleet().car(&car).and_then(|car| car.map.clone());
     match map {
         Some((map, _)) => Json(&*map).into_response(),
         None => (StatusCode::NOT_FOUND, format!("no map of {car} yet")).into_response(),
@@ -47,7 +47,8 @@ pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandR
         expected_revision,
         action,
     };
-    match app.hub.link().send(&car, &command, PATIENCE).await {
+    let Some(hub) = &app.hub else { return in_a_replay() };
+    match hub.link().send(&car, &command, PATIENCE).await {
         Ok(verdict) => Json(json!({
             "id": command.id,
             "done": verdict.exit_code() == 0,
@@ -63,24 +64,52 @@ pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandR
 #[serde(deny_unknown_fields)]
 pub(super) struct RecordRequest {
     on: bool,
+    operator: String,
 }
 
 /// Begins or ends a recording, in a file named by the time.
 pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordRequest>) -> Response {
-    if request.on {
+    let RecordRequest { on, operator } = request;
+    let Some(hub) = &app.hub else { return in_a_replay() };
+    if operator.len() > Command::MAX_OPERATOR {
+        return too_long();
+    }
+    let say = |severity, text: String| {
+        let who = Some(operator.clone());
+        app.board
+            .fleet()
+            .say(unix_now(), None, severity, "recorder", text, who);
+    };
+    if on {
         let file = app
             .recordings
             .join(format!("session-{}.mcap", unix_now() / 1_000_000_000));
-        match app.hub.start_recording(&file).await {
-            Ok(()) => Json(json!({"recording": file.display().to_string()})).into_response(),
+        match hub.start_recording(&file).await {
+            Ok(()) => {
+                say(Severity::Info, format!("recording into {}", file.display()));
+                Json(json!({"recording": file.display().to_string()})).into_response()
+            }
             Err(error) => (StatusCode::CONFLICT, error.to_string()).into_response(),
         }
     } else {
-        match app.hub.stop_recording().await {
+        match hub.stop_recording().await {
             Some(Ok(summary)) => {
-                Json(json!({"missing": summary.missing(), "summary": summary})).into_response()
+                let (messages, missing) = (summary.messages, summary.missing());
+                let severity = if missing > 0 {
+                    Severity::Warning
+                } else {
+                    Severity::Info
+                };
+                say(
+                    severity,
+                    format!("recording ended: {messages} messages, {missing} missing"),
+                );
+                Json(json!({"missing": missing, "summary": summary})).into_response()
             }
-            Some(Err(error)) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+            Some(Err(error)) => {
+                say(Severity::Critical, format!("recording failed: {error}"));
+                (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response()
+            }
             None => (StatusCode::CONFLICT, "no recording is going on").into_response(),
         }
     }
@@ -98,12 +127,56 @@ pub(super) struct MarkRequest {
 pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest>) -> Response {
     const LONGEST: usize = 500;
     let MarkRequest { car, operator, text } = request;
+    let Some(hub) = &app.hub else { return in_a_replay() };
     if text.len() > LONGEST || operator.len() > Command::MAX_OPERATOR {
-        return (StatusCode::BAD_REQUEST, "too long").into_response();
+        return too_long();
     }
-    if app.hub.fleet().car(&car).is_none() {
+    if app.board.fleet().car(&car).is_none() {
         return (StatusCode::NOT_FOUND, format!("no such car: {car}")).into_response();
     }
-    app.hub.mark(&car, &operator, &text);
+    hub.mark(&car, &operator, &text);
     StatusCode::NO_CONTENT.into_response()
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct AcknowledgeRequest {
+    operator: String,
+}
+
+/// Takes every alarm so far as seen, for all pages.
+pub(super) async fn acknowledge(State(app): State<App>, Json(request): Json<AcknowledgeRequest>) -> Response {
+    if request.operator.len() > Command::MAX_OPERATOR {
+        return too_long();
+    }
+    app.board.fleet().acknowledge(app.now(), &request.operator);
+    StatusCode::NO_CONTENT.into_response()
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ReplayRequest {
+    playing: Option<bool>,
+    speed: Option<f64>,
+    at: Option<f64>,
+}
+
+/// Plays, pauses, changes the speed or jumps.
+pub(super) async fn replay(State(app): State<App>, Json(request): Json<ReplayRequest>) -> Response {
+    let Some(replay) = &app.replay else {
+        return (StatusCode::CONFLICT, "the cars are live: nothing is replayed").into_response();
+    };
+    let ReplayRequest { playing, speed, at } = request;
+    match replay.steer(playing, speed, at) {
+        Ok(()) => Json(replay.view()).into_response(),
+        Err(fault) => (StatusCode::BAD_REQUEST, fault).into_response(),
+    }
+}
+
+fn in_a_replay() -> Response {
+    (StatusCode::CONFLICT, "this is a replay: the cars are not there").into_response()
+}
+
+fn too_long() -> Response {
+    (StatusCode::BAD_REQUEST, "too long").into_response()
 }

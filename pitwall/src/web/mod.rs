@@ -2,19 +2,24 @@
 //!
 //! ```text
 //! GET  /               the page and its files, embedded in the program
-//! GET  /ws             a snapshot of all cars 15 times a second, and log lines as they come; in: {"select": "car-1"}
+//! GET  /ws             a snapshot of all cars 15 times a second, and log lines as they come;
+//!                      in: {"select": "car-1", "operator": "ana"}
 //! GET  /snapshot       one snapshot
 //! GET  /map/<car>      the map that a car localizes on
 //! POST /command        {car, operator, expected_revision, id, action}: waits for the car and says what became of it
-//! POST /record         {"on": true|false}
+//! POST /record         {"on": true|false, "operator"}
 //! POST /mark           {car, operator, text}
+//! POST /acknowledge    {operator}: every alarm so far has been seen
+//! POST /replay         {"playing": bool, "speed": n, "at": s}, each if it is to change; only in a replay
 //! POST /rerun          starts the Rerun viewer's data and says where the viewer is; it is served under /rerun/
 //! ```
 //!
 //! Only pages of our own origin are served, and nothing on the page comes from anywhere else: the
 //! `Content-Security-Policy` says so to the browser. On any but a loopback address a token is asked for.
 mod api;
+mod disk;
 mod guard;
+mod present;
 #[cfg(feature = "rerun")]
 mod rerun;
 mod snapshot;
@@ -22,17 +27,23 @@ mod snapshot;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::Router;
 use axum::http::header;
 use axum::response::IntoResponse;
 use axum::routing::{get, post};
+use protocol::Severity;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
+use crate::board::Board;
 use crate::hub::Hub;
+use crate::link::unix_now;
+use crate::replay::Replay;
 use guard::Guard;
+use present::Present;
 
 /// How the page is served.
 #[derive(Debug, Clone)]
@@ -62,14 +73,30 @@ pub struct Page {
 /// What every request may need.
 #[derive(Clone)]
 struct App {
-    hub: Arc<Hub>,
+    board: Arc<Board>,
+    /// The way to the cars; None in a replay.
+    hub: Option<Arc<Hub>>,
+    /// None when live.
+    replay: Option<Arc<Replay>>,
     recordings: Arc<PathBuf>,
+    disk_free: watch::Receiver<Option<u64>>,
+    present: Present,
     stopping: watch::Receiver<bool>,
     #[cfg(feature = "rerun")]
     pane: Arc<tokio::sync::Mutex<Option<rerun::Pane>>>,
 }
 
 impl App {
+    /// The time that is shown [unix ns].
+    fn now(&self) -> i64 {
+        self.replay.as_ref().map_or_else(unix_now, |replay| replay.now())
+    }
+
+    /// Room on the recordings' disk [bytes].
+    fn disk_free(&self) -> Option<u64> {
+        *self.disk_free.borrow()
+    }
+
     /// Ends when the page is to stop.
     async fn stopped(&self) {
         drop(self.stopping.clone().wait_for(|stop| *stop).await);
@@ -79,14 +106,41 @@ impl App {
 impl Page {
     /// Binds the address and serves until [`Page::stop`].
     pub async fn serve(hub: Arc<Hub>, options: PageOptions) -> std::io::Result<Self> {
+        Self::serve_from(hub.board().clone(), Some(hub), None, options).await
+    }
+
+    /// Serves a recording in place of cars.
+    pub async fn serve_replay(replay: Arc<Replay>, options: PageOptions) -> std::io::Result<Self> {
+        Self::serve_from(replay.board().clone(), None, Some(replay), options).await
+    }
+
+    async fn serve_from(
+        board: Arc<Board>,
+        hub: Option<Arc<Hub>>,
+        replay: Option<Arc<Replay>>,
+        options: PageOptions,
+    ) -> std::io::Result<Self> {
         let listener = TcpListener::bind(options.address).await?;
         let address = listener.local_addr()?;
         let guard = Guard::new(address);
         let url = guard.url(address);
         let (stop, stopping) = watch::channel(false);
+        let (room, disk_free) = watch::channel(None);
+        if hub.is_some() {
+            tokio::spawn(look_at_disk(
+                board.clone(),
+                options.recordings.clone(),
+                room,
+                stopping.clone(),
+            ));
+        }
         let app = App {
+            board,
             hub,
+            replay,
             recordings: Arc::new(options.recordings),
+            disk_free,
+            present: Present::default(),
             stopping,
             #[cfg(feature = "rerun")]
             pane: Arc::default(),
@@ -97,7 +151,9 @@ impl Page {
             .route("/map/{car}", get(api::map))
             .route("/command", post(api::command))
             .route("/record", post(api::record))
-            .route("/mark", post(api::mark));
+            .route("/mark", post(api::mark))
+            .route("/acknowledge", post(api::acknowledge))
+            .route("/replay", post(api::replay));
         #[cfg(feature = "rerun")]
         let router = router
             .route("/rerun", post(rerun::open))
@@ -130,6 +186,37 @@ impl Page {
     }
 }
 
+/// Takes the room on the disk every few seconds, and says so when it runs short during a recording.
+async fn look_at_disk(
+    board: Arc<Board>,
+    folder: PathBuf,
+    room: watch::Sender<Option<u64>>,
+    mut stopping: watch::Receiver<bool>,
+) {
+    let mut ticks = tokio::time::interval(Duration::from_secs(5));
+    let mut said = false;
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => {}
+            _ = stopping.wait_for(|stop| *stop) => return,
+        }
+        let folder = folder.clone();
+        // A network drive may take its time.
+        let Ok(free) = tokio::task::spawn_blocking(move || disk::free(&folder)).await else {
+            return;
+        };
+        room.send_replace(free);
+        let scarce = board.recording().is_some() && free.is_some_and(|free| free < disk::SCARCE);
+        if scarce && !said {
+            let text = format!("{:.1} GB left for the recording", free.unwrap_or(0) as f64 / 1e9);
+            board
+                .fleet()
+                .say(unix_now(), None, Severity::Critical, "disk", text, None);
+        }
+        said = scarce;
+    }
+}
+
 /// The page's own files.
 fn files() -> Router<App> {
     let file = |content: &'static str, kind: &'static str| {
@@ -147,8 +234,11 @@ fn files() -> Router<App> {
         )
         .route("/app.js", file(include_str!("page/app.js"), script))
         .route("/cards.js", file(include_str!("page/cards.js"), script))
-        .route("/track.js", file(include_str!("page/track.js"), script))
+        .route("/chart.js", file(include_str!("page/chart.js"), script))
+        .route("/large.js", file(include_str!("page/large.js"), script))
         .route("/lists.js", file(include_str!("page/lists.js"), script))
         .route("/link.js", file(include_str!("page/link.js"), script))
+        .route("/sound.js", file(include_str!("page/sound.js"), script))
+        .route("/track.js", file(include_str!("page/track.js"), script))
         .route("/icon.svg", file(include_str!("page/icon.svg"), "image/svg+xml"))
 }

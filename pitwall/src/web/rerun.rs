@@ -27,8 +27,8 @@ pub(super) async fn open(State(app): State<App>) -> Response {
     let mut pane = app.pane.lock().await;
     if pane.is_none() {
         let started = free_port().map_err(|error| error.to_string()).and_then(|port| {
-            let view =
-                RerunView::start(app.hub.tap(), &RerunOutlet::Serve(port)).map_err(|e| e.to_string())?;
+            let view = RerunView::start(app.board.tap(app.now()), &RerunOutlet::Serve(port))
+                .map_err(|e| e.to_string())?;
             Ok(Pane { view, port })
         });
         match started {

@@ -1,20 +1,23 @@
 //! What the page shows, many times a second.
 
-use std::time::Duration;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use axum::Json;
 use axum::extract::State;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
 use axum::response::Response;
-use protocol::CarName;
+use protocol::{CarName, Command};
 use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 
 use super::App;
-use crate::car::{CarView, Lap};
-use crate::hub::Hub;
-use crate::link::unix_now;
+use crate::car::{Car, CarView};
+use crate::history::{Moment, Place};
+use crate::laps::Lap;
 use crate::log::LogEntry;
+use crate::recording::Progress;
+use crate::replay::ReplayView;
 
 /// Snapshots per second.
 const RATE: f64 = 15.0;
@@ -22,41 +25,67 @@ const RATE: f64 = 15.0;
 const HISTORY: u64 = 300;
 /// A browser that does not take a message within this time is let go.
 const SLOW: Duration = Duration::from_secs(5);
+/// How often the selected car's lap is painted anew.
+const REPAINT: Duration = Duration::from_secs(1);
 
 /// All cars at one moment.
 #[derive(Serialize)]
 pub(super) struct Snapshot {
-    /// When [unix ns].
+    /// When [unix ns]; in a replay, when in the recording.
     now: i64,
+    /// When it was made, by the laptop's clock [unix ns].
+    made: i64,
+    /// Another one than before: all that was said before is void.
+    epoch: u64,
     cars: Vec<CarView>,
     /// Cars with a map to fetch.
     maps: Vec<CarName>,
     recording: Option<RecordingView>,
+    /// Room on the recordings' disk [bytes].
+    disk_free: Option<u64>,
     /// Particles and end points of the selected car.
     selected: Option<Selected>,
     /// What happened since the last snapshot.
     log: Vec<LogEntry>,
+    /// Alarms up to this line have been acknowledged.
+    acknowledged: u64,
+    /// Who looks at a page.
+    operators: Vec<String>,
+    replay: Option<ReplayView>,
+    /// In the first snapshot that a page gets.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hello: Option<Hello>,
+}
+
+/// What a page needs to know once.
+#[derive(Serialize)]
+struct Hello {
+    /// True when the Rerun viewer is built in.
+    rerun: bool,
+    /// The last two minutes of each car.
+    history: BTreeMap<CarName, Vec<Moment>>,
 }
 
 #[derive(Serialize)]
 struct RecordingView {
     file: String,
-    bytes: u64,
-    seconds: f64,
-    messages: u64,
-    missing: u64,
-    overrun: u64,
-    error: Option<String>,
+    #[serde(flatten)]
+    progress: Progress,
 }
 
 #[derive(Serialize)]
 struct Selected {
     car: CarName,
     /// `[x, y, heading, weight]` [m, m, rad, 0..1].
-    particles: Vec<[f64; 4]>,
+    particles: Vec<[f32; 4]>,
     /// `[x, y, kind]` [m, m, see `EndPointKind`].
-    end_points: Vec<[f64; 3]>,
-    laps: Vec<Lap>,
+    end_points: Vec<[f32; 3]>,
+    /// None when they are as they were.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    laps: Option<Vec<Lap>>,
+    /// Health along the lap; None when it is as it was.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    strip: Option<Vec<Option<Place>>>,
 }
 
 /// What a page says.
@@ -65,16 +94,43 @@ struct Selected {
 struct Wish {
     /// The car whose particles and end points it wants.
     select: Option<CarName>,
+    /// Who looks at it.
+    operator: Option<String>,
 }
 
-impl Snapshot {
-    /// The cars now, and the log after line `seen`.
-    pub(super) fn take(hub: &Hub, selected: Option<&CarName>, seen: &mut u64) -> Self {
-        let now = unix_now();
-        let fleet = hub.fleet();
-        let log = fleet.log().since(*seen).cloned().collect();
-        *seen = fleet.log().last();
-        let selected = selected.and_then(|name| fleet.car(name)).map(|car| Selected {
+/// What one page has been sent.
+#[derive(Default)]
+struct Seen {
+    /// The last log line.
+    log: u64,
+    epoch: Option<u64>,
+    /// The selected car, how many laps it had, and when its lap was painted.
+    car: Option<(CarName, usize, Instant)>,
+}
+
+impl Seen {
+    fn nothing(app: &App) -> Self {
+        Self {
+            log: app.board.fleet().log().last().saturating_sub(HISTORY),
+            ..Self::default()
+        }
+    }
+
+    /// Details of `car`, leaving out what is as it was.
+    fn details(&mut self, car: &Car) -> Selected {
+        let count = car.laps().len();
+        let (laps_known, painted) = match &self.car {
+            Some((name, laps, painted)) if *name == car.name => (Some(*laps), Some(*painted)),
+            _ => (None, None),
+        };
+        let paint = painted.is_none_or(|at| at.elapsed() >= REPAINT);
+        let painted = if paint {
+            Instant::now()
+        } else {
+            painted.unwrap_or_else(Instant::now)
+        };
+        self.car = Some((car.name.clone(), count, painted));
+        Selected {
             car: car.name.clone(),
             particles: car
                 .cloud
@@ -82,7 +138,8 @@ impl Snapshot {
                 .flat_map(|cloud| {
                     cloud.particles.iter().map(|&particle| {
                         let pose = cloud.pose(particle);
-                        [pose.x, pose.y, pose.heading, f64::from(particle.weight) / 65535.0]
+                        let weight = f32::from(particle.weight) / 65535.0;
+                        [pose.x as f32, pose.y as f32, pose.heading as f32, weight]
                     })
                 })
                 .collect(),
@@ -92,44 +149,78 @@ impl Snapshot {
                 .flat_map(|scan| {
                     scan.points.iter().map(|&point| {
                         let [x, y] = scan.point(point);
-                        [x, y, f64::from(u8::from(point.kind))]
+                        [x as f32, y as f32, f32::from(u8::from(point.kind))]
                     })
                 })
                 .collect(),
-            laps: car.laps.clone(),
+            laps: (laps_known != Some(count)).then(|| car.laps().to_vec()),
+            strip: paint.then(|| car.strip().to_vec()),
+        }
+    }
+}
+
+impl Snapshot {
+    /// The cars now, and what happened since the page was told last.
+    fn take(app: &App, selected: Option<&CarName>, seen: &mut Seen) -> Self {
+        let now = app.now();
+        let fleet = app.board.fleet();
+        let epoch = fleet.epoch();
+        let anew = seen.epoch.replace(epoch) != Some(epoch);
+        if anew {
+            *seen = Self::anew(&fleet, epoch);
+        }
+        let log = fleet.log().since(seen.log).cloned().collect();
+        seen.log = fleet.log().last();
+        let hello = anew.then(|| Hello {
+            rerun: cfg!(feature = "rerun"),
+            history: fleet
+                .cars()
+                .map(|car| (car.name.clone(), car.history().copied().collect()))
+                .collect(),
         });
+        let selected = selected
+            .and_then(|name| fleet.car(name))
+            .map(|car| seen.details(car));
         let cars = fleet.view(now);
         let maps = fleet
             .cars()
             .filter(|car| car.map.is_some())
             .map(|car| car.name.clone())
             .collect();
+        let acknowledged = fleet.log().acknowledged();
         drop(fleet);
         Self {
             now,
+            made: crate::link::unix_now(),
+            epoch,
             cars,
             maps,
-            recording: hub
-                .recording()
-                .zip(hub.recording_path())
-                .map(|(status, file)| RecordingView {
-                    file: file.display().to_string(),
-                    bytes: status.bytes,
-                    seconds: status.summary.duration_s,
-                    messages: status.summary.messages,
-                    missing: status.summary.missing(),
-                    overrun: status.overrun,
-                    error: status.error,
-                }),
+            recording: app.board.recording().map(|(file, progress)| RecordingView {
+                file: file.display().to_string(),
+                progress,
+            }),
+            disk_free: app.disk_free(),
             selected,
             log,
+            acknowledged,
+            operators: app.present.names(),
+            replay: app.replay.as_ref().map(|replay| replay.view()),
+            hello,
+        }
+    }
+
+    fn anew(fleet: &crate::fleet::Fleet, epoch: u64) -> Seen {
+        Seen {
+            log: fleet.log().last().saturating_sub(HISTORY),
+            epoch: Some(epoch),
+            car: None,
         }
     }
 }
 
 pub(super) async fn once(State(app): State<App>) -> Json<Snapshot> {
-    let mut seen = app.hub.fleet().log().last().saturating_sub(HISTORY);
-    Json(Snapshot::take(&app.hub, None, &mut seen))
+    let mut seen = Seen::nothing(&app);
+    Json(Snapshot::take(&app, None, &mut seen))
 }
 
 pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) -> Response {
@@ -141,13 +232,14 @@ pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) ->
 /// Sends snapshots until the page goes away. Each is made when it is sent: a slow page gets fewer, never older ones.
 async fn follow(app: App, mut socket: WebSocket) {
     let mut selected: Option<CarName> = None;
-    let mut seen = app.hub.fleet().log().last().saturating_sub(HISTORY);
+    let mut seen = Seen::nothing(&app);
+    let present = app.present.enter();
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tokio::select! {
             _ = ticks.tick() => {
-                let snapshot = Snapshot::take(&app.hub, selected.as_ref(), &mut seen);
+                let snapshot = Snapshot::take(&app, selected.as_ref(), &mut seen);
                 let Ok(text) = serde_json::to_string(&snapshot) else { return };
                 let sent = tokio::time::timeout(SLOW, socket.send(Message::Text(text.into()))).await;
                 if !matches!(sent, Ok(Ok(()))) {
@@ -156,7 +248,13 @@ async fn follow(app: App, mut socket: WebSocket) {
             }
             message = socket.recv() => match message {
                 Some(Ok(Message::Text(text))) => match serde_json::from_str::<Wish>(&text) {
-                    Ok(wish) => selected = wish.select,
+                    Ok(wish) => {
+                        selected = wish.select;
+                        if let Some(mut operator) = wish.operator {
+                            operator.truncate(operator.floor_char_boundary(Command::MAX_OPERATOR));
+                            present.is(operator);
+                        }
+                    }
                     Err(error) => tracing::debug!(%error, "a page said something strange"),
                 },
                 Some(Ok(_)) => {}

@@ -1,21 +1,24 @@
 // Puts the page together: snapshots to views, buttons and keys to commands.
 
 import { command, connect, post } from "/link.js";
-import { Cards, STATES, fixed } from "/cards.js";
-import { Track } from "/track.js";
-import { Log, showLaps, showNumbers } from "/lists.js";
+import { Cards, STATES, element, fixed, lasting, otherSet } from "/cards.js";
+import { Large } from "/large.js";
+import { Track, palette } from "/track.js";
+import { Log, showLaps, showNumbers, showStandings } from "/lists.js";
+import { Sound } from "/sound.js";
 
 const $ = (id) => document.getElementById(id);
+const press = (button, on) => button.setAttribute("aria-pressed", String(on));
 let snapshot = null;
 let selected = null;
-let first = true;
+let epoch = null;
+let laps = { car: null, laps: [] };
+let pace = "";
+/// How old snapshots were when they had been drawn [ms], the last thousand: for whoever measures this page.
+const ages = [];
 
 const operator = $("operator");
 operator.value = localStorage.getItem("operator") || "engineer";
-operator.addEventListener("change", () => {
-  operator.value = operator.value.trim() || "engineer";
-  localStorage.setItem("operator", operator.value);
-});
 
 async function act(car, action, expected = null) {
   cards.outcome(car, { done: null, text: "asking the car" });
@@ -24,66 +27,144 @@ async function act(car, action, expected = null) {
   return result;
 }
 
-const cards = new Cards($("cars"), act, select);
+const acts = {
+  select,
+  choose: (car, name, revision) => act(car, { params: { select: { name, revert_after_ms: null } } }, revision),
+  shadow: (car, name) => act(car, { params: { shadow: { name: name ?? null } } }),
+  search,
+  open: (car) => { select(car); large(true); },
+  close: () => large(false),
+};
+const cards = new Cards($("cars"), acts);
+const big = new Large($("large"), acts);
 const track = new Track($("map"), placed, picked);
-const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"));
-const link = connect(take, (up) => {
+const sound = new Sound($("sound"));
+const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"), sound);
+const link = connect(take, ({ up, silent_s: silent, rate }) => {
   const badge = $("link");
-  badge.textContent = up ? "live" : "the pit wall's program does not answer";
+  badge.textContent = up ? (snapshot?.replay ? "replay" : "live") : `no news for ${lasting(silent)}: the pit wall's program does not answer`;
   badge.className = `badge ${up ? "up" : "down"}`;
+  badge.title = `${fixed(rate, 0)} snapshots a second`;
   document.body.classList.toggle("cut", !up);
-  if (!up) { first = true; log.restart(); }
+  const late = [...ages].sort((a, b) => a - b);
+  pace = `${fixed(rate, 0)} snapshots /s; drawn after ${fixed(late[late.length >> 1], 0)} ms, p99 ${fixed(late[Math.floor(late.length * 0.99)], 0)} ms`;
+});
+link.operator(operator.value);
+operator.addEventListener("change", () => {
+  operator.value = operator.value.trim() || "engineer";
+  localStorage.setItem("operator", operator.value);
+  link.operator(operator.value);
 });
 
 function take(next) {
   snapshot = next;
-  $("empty").hidden = next.cars.length > 0;
-  if (!selected && next.cars.length) select(next.cars[0].car);
-  cards.update(next.cars, selected);
-  track.update(next, selected);
-  log.add(next.log, first);
-  first = false;
-  showRecording(next.recording);
-  const options = $("filter-car");
-  for (const { car } of next.cars) {
-    if (![...options.options].some((option) => option.value === car)) options.append(new Option(car, car));
+  const first = next.epoch !== epoch || Boolean(next.hello);
+  if (first) {
+    epoch = next.epoch;
+    log.restart();
+    track.restart();
+    cards.keep(next.cars.map((car) => car.car));
   }
-  if (!$("laps-panel").hidden && next.selected) showLaps($("laps"), next.selected.laps, next.selected.car);
-  if (!$("numbers-panel").hidden) showNumbers($("numbers"), next.cars.find((car) => car.car === selected));
+  $("empty").hidden = next.cars.length > 0;
+  if ((!selected || (first && !next.cars.some((car) => car.car === selected))) && next.cars.length) select(next.cars[0].car);
+  cards.update(next.cars, selected, next.now / 1e9);
+  if (next.hello) {
+    cards.remember(next.hello.history);
+    $("rerun").hidden = !next.hello.rerun;
+  }
+  track.update(next, selected);
+  log.add(next.log, next.acknowledged, first);
+  showRecording(next);
+  showReplay(next.replay);
+  showPeople(next.operators);
+  const options = $("filter-car");
+  if (options.length <= next.cars.length) {
+    for (const { car } of next.cars) {
+      if (![...options.options].some((option) => option.value === car)) options.append(new Option(car, car));
+    }
+  }
+  const index = next.cars.findIndex((car) => car.car === selected);
+  if (next.selected?.laps) laps = { car: next.selected.car, laps: next.selected.laps };
+  if (!$("laps-panel").hidden) {
+    showStandings($("standings"), next.cars, select);
+    showLaps($("laps"), laps.laps, laps.car);
+  }
+  if (!$("numbers-panel").hidden) showNumbers($("numbers"), next.cars[index], pace);
+  if (!$("large").hidden && index >= 0) big.update(next.cars[index], index, cards.history(selected), next.now / 1e9);
+  // After this frame is drawn.
+  requestAnimationFrame(() => {
+    ages.push(Date.now() - next.made / 1e6);
+    if (ages.length > 1000) ages.shift();
+  });
 }
 
 function select(car) {
   if (selected !== car) {
-    track.candidates = [];
+    offer([]);
     place(false);
   }
   selected = car;
   link.select(car);
 }
 
-function showRecording(recording) {
+function showPeople(names) {
+  const others = names.length > 1 ? `${names.length} pages: ${[...new Set(names.filter(Boolean))].join(", ")}` : "";
+  if ($("people").textContent !== others) $("people").textContent = others;
+}
+
+let saved = "";
+function showRecording({ recording, disk_free: free, replay }) {
   const button = $("record");
-  button.setAttribute("aria-pressed", String(Boolean(recording)));
-  button.textContent = recording ? "■ stop" : "● record";
+  button.hidden = Boolean(replay);
+  if (button.getAttribute("aria-pressed") !== String(Boolean(recording))) {
+    press(button, Boolean(recording));
+    button.textContent = recording ? "■ stop" : "● record";
+  }
+  const room = free === null ? "" : `${fixed(free / 1e9, 0)} GB free`;
+  let text = saved || room;
   if (recording) {
     const missing = recording.missing + recording.overrun;
-    $("recording").textContent = recording.error ??
-      `${recording.file}  ${fixed(recording.seconds, 0)} s, ${fixed(recording.bytes / 1e6, 1)} MB, ${missing ? `${missing} missing` : "nothing missing"}`;
+    const rate = recording.seconds > 5 ? recording.bytes / recording.seconds : 0;
+    const left = free !== null && rate > 0 ? `, room for ${fixed(free / rate / 3600, 0)} h` : "";
+    text = recording.error ?? `${lasting(recording.seconds)}, ${fixed(recording.bytes / 1e6, 1)} MB${left}, ${missing ? `${missing} MISSING` : "nothing missing"}`;
+    $("recording").title = recording.file;
   }
+  if ($("recording").textContent !== text) $("recording").textContent = text;
 }
 
 async function record() {
   const on = !snapshot?.recording;
   $("record").disabled = true;
-  const { ok, body } = await post("/record", { on });
+  const { ok, body } = await post("/record", { on, operator: operator.value });
   $("record").disabled = false;
-  $("recording").textContent = !ok ? body : on ? body.recording
-    : `saved: ${body.summary.messages} messages, ${body.missing ? `${body.missing} missing` : "nothing missing"}`;
+  saved = !ok ? body : on ? "" : `saved: ${body.summary.messages} messages, ${body.missing ? `${body.missing} missing` : "nothing missing"}`;
 }
+
+let seeking = false;
+function showReplay(replay) {
+  $("replay").hidden = !replay;
+  if (!replay) return;
+  $("play").textContent = replay.playing ? "❚❚" : "▶";
+  $("replay-time").textContent = `${lasting(replay.at_s)} of ${lasting(replay.duration_s)}`;
+  $("replay-file").textContent = replay.file.split("/").at(-1);
+  if (!seeking) $("seek").value = replay.duration_s ? 1000 * replay.at_s / replay.duration_s : 0;
+  for (const id of ["place", "search", "mark"]) $(id).disabled = true;
+}
+const steer = (wish) => snapshot?.replay && post("/replay", wish);
+const playPause = () => steer({ playing: !snapshot.replay.playing });
+const skip = (s) => steer({ at: Math.max(0, (snapshot?.replay?.at_s ?? 0) + s) });
+$("play").addEventListener("click", playPause);
+$("seek").addEventListener("input", () => { seeking = true; });
+$("seek").addEventListener("change", async () => {
+  await steer({ at: $("seek").value / 1000 * snapshot.replay.duration_s });
+  seeking = false;
+});
+$("speed").addEventListener("change", () => steer({ speed: Number($("speed").value) }));
 
 function place(on) {
   track.placing = on && Boolean(selected);
-  $("place").setAttribute("aria-pressed", String(track.placing));
+  press($("place"), track.placing);
+  $("map").classList.toggle("placing", track.placing);
   $("hint").textContent = track.placing ? `press where ${selected} stands, drag towards its heading` : "";
 }
 
@@ -92,27 +173,63 @@ async function placed(x, y, heading) {
   await act(selected, { pose: { x, y, heading } });
 }
 
-async function search() {
-  if (!selected) return;
-  const result = await act(selected, { relocalize: "search" });
+/// Shows where the car may be, on the track and as buttons.
+function offer(candidates) {
+  track.candidates = candidates;
+  $("candidates").hidden = candidates.length < 2;
+  $("candidates").replaceChildren(...candidates.map(({ number, score }) => {
+    const button = element("button", "", `${number}: ${fixed(score * 100, 0)} %`);
+    button.addEventListener("click", () => picked(number));
+    return button;
+  }));
+  $("hint").textContent = candidates.length > 1 ? `${selected} may be in ${candidates.length} places and follows the first: pick another, here or on the track` : "";
+}
+
+async function search(car = selected) {
+  if (!car) return;
+  select(car);
+  const result = await act(car, { relocalize: "search" });
   const reply = result.verdict?.answer?.outcome?.done?.reply;
-  track.candidates = reply?.candidates ?? [];
-  $("hint").textContent = track.candidates.length > 1 ? "click a candidate to take it" : "";
+  if (selected === car) offer(reply?.candidates ?? []);
 }
 
 async function picked(candidate) {
-  $("hint").textContent = "";
-  const result = await act(selected, { relocalize: { pick: { candidate } } });
-  if (result.done) track.candidates = [];
+  offer([]);
+  await act(selected, { relocalize: { pick: { candidate } } });
 }
 
-function follow() {
-  track.follow = !track.follow;
-  $("follow").setAttribute("aria-pressed", String(track.follow));
+function follow(on = !track.follow) {
+  track.follow = on;
+  press($("follow"), on);
+}
+
+function paint() {
+  const [name, legend] = track.paintNext();
+  $("paint").textContent = `paint: ${name}`;
+  press($("paint"), name !== "off");
+  $("legend-paint").hidden = name === "off";
+  const colours = palette();
+  $("legend-paint").replaceChildren(element("span", "", name), ...legend.map(([colour, text]) => {
+    const item = element("span");
+    const swatch = element("i");
+    swatch.style.background = colours[colour];
+    item.append(swatch, text);
+    return item;
+  }));
+}
+
+function large(on = $("large").hidden) {
+  $("large").hidden = !on || !selected;
+  if (!on) $("map").focus();
+}
+
+function shadow() {
+  const car = snapshot?.cars.find(({ car }) => car === selected);
+  if (car) acts.shadow(selected, car.shadow ? null : otherSet(car));
 }
 
 function mark() {
-  if (!selected) return;
+  if (!selected || snapshot?.replay) return;
   $("marker-text").value = "";
   $("marker").returnValue = "";
   $("marker").showModal();
@@ -137,7 +254,7 @@ async function rerun() {
     viewer.src = "about:blank";
   }
   viewer.hidden = !on;
-  $("rerun").setAttribute("aria-pressed", String(on));
+  press($("rerun"), on);
 }
 
 function theme(name) {
@@ -150,38 +267,41 @@ theme(localStorage.getItem("theme") || (prefersLight ? "light" : "dark"));
 const otherTheme = () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
 
 const TABS = ["log", "laps", "numbers"];
-for (const tab of TABS) {
-  $(`tab-${tab}`).addEventListener("click", () => {
-    for (const other of TABS) {
-      $(`tab-${other}`).setAttribute("aria-selected", String(other === tab));
-      $(`${other}-panel`).hidden = other !== tab;
-    }
-  });
-}
-for (const [word, [shape, , meaning]] of Object.entries(STATES)) {
-  const item = document.createElement("li");
-  item.textContent = `${shape} ${word}: ${meaning}`;
-  $("legend").append(item);
-}
-const fit = () => { track.follow = false; $("follow").setAttribute("aria-pressed", "false"); track.fit(); };
-$("record").addEventListener("click", record);
-$("theme").addEventListener("click", otherTheme);
-$("help-button").addEventListener("click", () => $("help").showModal());
-$("fit").addEventListener("click", fit);
-$("follow").addEventListener("click", follow);
-$("place").addEventListener("click", () => place(!track.placing));
-$("search").addEventListener("click", search);
-$("mark").addEventListener("click", mark);
-$("rerun").addEventListener("click", rerun);
-$("acknowledge").addEventListener("click", () => log.acknowledge());
+const tab = (shown) => {
+  for (const other of TABS) {
+    $(`tab-${other}`).setAttribute("aria-selected", String(other === shown));
+    $(`${other}-panel`).hidden = other !== shown;
+  }
+};
+for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => tab(name));
+for (const [word, [shape, , meaning]] of Object.entries(STATES)) $("legend").append(element("li", "", `${shape} ${word}: ${meaning}`));
 
+const acknowledge = () => post("/acknowledge", { operator: operator.value });
+const fit = () => { follow(false); track.fit(); };
+const help = () => $("help").showModal();
+const CLICKS = {
+  record, theme: otherTheme, "help-button": help, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
+  mark, rerun, acknowledge, alarm: acknowledge, sound: () => sound.toggle(),
+};
+for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
+
+const step = (by) => {
+  const index = snapshot?.cars.findIndex(({ car }) => car === selected) ?? -1;
+  const car = snapshot?.cars[Math.min(Math.max(index + by, 0), snapshot.cars.length - 1)];
+  if (!car) return;
+  select(car.car);
+  document.querySelector(`.card[data-car="${car.car}"]`)?.scrollIntoView({ block: "nearest" });
+};
 const KEYS = {
-  r: record, t: otherTheme, "?": () => $("help").showModal(), 0: fit, f: follow, g: search, m: mark, v: rerun,
-  i: () => place(!track.placing), a: () => log.acknowledge(),
+  r: record, t: otherTheme, "?": help, 0: fit, f: () => follow(), g: () => search(), m: mark, p: paint, s: shadow, o: () => large(),
+  v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,
+  e: () => tab("log"), l: () => tab("laps"), u: () => tab("numbers"),
   "+": () => track.zoom(1.3), "=": () => track.zoom(1.3), "-": () => track.zoom(1 / 1.3),
   c: () => selected && act(selected, { params: "confirm" }),
   H: () => cards.cards.get(selected)?.choose("hq"), L: () => cards.cards.get(selected)?.choose("lq"),
-  Escape: () => { place(false); track.candidates = []; $("hint").textContent = ""; },
+  ArrowDown: () => step(1), ArrowUp: () => step(-1),
+  ",": () => skip(-5), ".": () => skip(5),
+  Escape: () => { place(false); offer([]); large(false); },
 };
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input, select") || document.querySelector("dialog[open]")) return;
@@ -191,9 +311,13 @@ addEventListener("keydown", (event) => {
     if (car) select(car.car);
     return;
   }
-  const action = KEYS[event.key];
+  // A focused button takes the space bar for itself.
+  const action = event.key === " " ? !event.target.matches("button") && snapshot?.replay && playPause : KEYS[event.key];
   if (action) {
     event.preventDefault();
     action();
   }
 });
+
+// For measurements and tests: what the page knows of itself.
+window.pitwall = { ages, toCanvas: (x, y) => track.toCanvas(x, y), get selected() { return selected; }, get snapshot() { return snapshot; } };

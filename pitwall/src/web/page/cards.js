@@ -1,6 +1,8 @@
 // The cars' cards. Elements are made once and then only their text changes.
 
-/// Word, shape, colour class and meaning of each state. Shape and word carry what the colour does.
+import { SPAN_S, plot } from "/chart.js";
+
+/// Shape, colour class and meaning of each state. Shape and word carry what the colour does.
 export const STATES = {
   INIT: ["○", "none", "no pose yet"],
   CONVERGING: ["◐", "busy", "a pose, not yet confirmed"],
@@ -12,7 +14,7 @@ export const STATES = {
   BLIND: ["□", "none", "nothing comes from the car"],
 };
 
-const COLOURS = ["#5aa9ff", "#ff9d5c", "#b98cff", "#2fd0c8", "#ff6fae", "#d8d84a", "#7fd46b", "#e07a5f", "#9fb4ff", "#c0a080"];
+const COLOURS = ["#5aa9ff", "#ff9d5c", "#b98cff", "#2fd0c8", "#ff6fae", "#c9c93a", "#7fd46b", "#e07a5f", "#9fb4ff", "#c0a080"];
 
 /// A car's own colour, by its place in the list.
 export const colourOf = (index) => COLOURS[index % COLOURS.length];
@@ -20,111 +22,193 @@ export const colourOf = (index) => COLOURS[index % COLOURS.length];
 export const fixed = (value, digits, unit = "") =>
   value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(digits) + unit;
 
-const element = (tag, className, text) => {
+/// A time without an end: 7 s, 3:05, 1:02:30.
+export const lasting = (s) => {
+  if (s === null || s === undefined) return "–";
+  if (s < 60) return `${s < 10 ? s.toFixed(1) : Math.floor(s)} s`;
+  const two = (n) => String(Math.floor(n)).padStart(2, "0");
+  return s < 3600 ? `${Math.floor(s / 60)}:${two(s % 60)}` : `${Math.floor(s / 3600)}:${two(s / 60 % 60)}:${two(s % 60)}`;
+};
+
+export const element = (tag, className, text) => {
   const made = document.createElement(tag);
   if (className) made.className = className;
   if (text !== undefined) made.textContent = text;
   return made;
 };
 
-const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
+export const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 
-const FACTS = [
-  ["speed", (c) => fixed(c.pose?.speed_mps, 1, " m/s")],
-  ["age", (c) => fixed(c.pose && c.pose.age_s * 1e3, 0, " ms"), (c) => c.pose?.age_s > 0.15],
-  ["alignment", (c) => fixed(c.health?.metrics && c.health.metrics.alignment * 100, 0, " %"), (c) => c.health?.metrics?.alignment < 0.7],
-  ["slip", (c) => fixed(c.health?.metrics && c.health.metrics.slip * 100, 0, " %"), (c) => Math.abs(c.health?.metrics?.slip) > 0.08],
-  ["last lap", (c) => fixed(c.last_lap_s, 2, " s")],
-  ["best lap", (c) => fixed(c.best_lap_s, 2, " s")],
-  ["poses", (c) => fixed(c.streams.pose?.rate_hz, 0, " /s")],
-  ["RTT", (c) => fixed(c.round_trip_s && c.round_trip_s * 1e3, 1, " ms"), (c) => c.round_trip_s > 0.1],
-  ["update p99", (c) => fixed(c.load && c.load.update_us.p99 / 1e3, 2, " ms"), (c) => c.load?.update_us.p99 > 10e3],
-  ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %")],
-  ["temp", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80],
-  ["missing", (c) => String(Object.values(c.streams).reduce((sum, s) => sum + s.missing, 0))],
+export const missing = (car) => Object.values(car.streams).reduce((sum, s) => sum + s.missing, 0);
+
+/// Label, text, what is off about it, and what it means.
+export const FACTS = [
+  ["speed", (c) => fixed(c.pose?.speed_mps, 1, " m/s"), null, "over ground"],
+  ["age", (c) => fixed(c.pose && c.pose.age_s * 1e3, 0, " ms"), (c) => c.pose?.age_s > 0.15, "how long ago the pose shown was true"],
+  ["alignment", (c) => fixed(c.health?.metrics && c.health.metrics.alignment * 100, 0, " %"), (c) => c.health?.metrics?.alignment < 0.7, "share of the beams that end at a wall of the map"],
+  ["slip", (c) => fixed(c.health?.metrics && c.health.metrics.slip * 100, 0, " %"), (c) => Math.abs(c.health?.metrics?.slip) > 0.08, "share of odometry's distance that was not driven"],
+  ["last lap", (c) => fixed(c.last_lap_s, 2, " s"), null, "the last lap"],
+  ["best lap", (c) => fixed(c.best_lap_s, 2, " s"), null, "the best lap"],
+  ["poses", (c) => fixed(c.streams.pose?.rate_hz, 0, " /s"), null, "poses that arrive"],
+  ["round trip", (c) => fixed(c.round_trip_s && c.round_trip_s * 1e3, 1, " ms"), (c) => c.round_trip_s > 0.1, "to the car and back"],
+  ["update p99", (c) => fixed(c.load && c.load.update_us.p99 / 1e3, 1, " ms"), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
+  ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
+  ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – where the machine does not tell"],
+  ["missing", (c) => String(missing(c)), null, "messages that were sent and did not arrive"],
 ];
 
-/// All cards. `act(car, action, expected)` gives a command, `select(car)` selects.
+/// Which set would be worth a look beside the one in force.
+export const otherSet = (car) => {
+  const names = car.set?.available ?? [];
+  const wish = car.health?.proposal?.set ?? (car.set?.name === "hq" ? "lq" : "hq");
+  return names.includes(wish) ? wish : names.find((name) => name !== car.set?.name);
+};
+
+/// What the comparison says, in one sentence.
+export const verdict = (shadow) => {
+  const c = shadow.comparison;
+  if (!c) return `${shadow.set} runs in the shadow; nothing to compare yet`;
+  const [force, other] = [c.in_force.name, shadow.set];
+  const lead = c.shadow_better - c.force_better;
+  const better = Math.abs(lead) < 0.1 ? `${force} and ${other} fit alike` : lead > 0 ? `${other} fits better than ${force}` : `${force} fits better than ${other}`;
+  return `${better}: ${fixed(c.shadow_better * 100, 0)} % of scans for ${other}, ${fixed(c.force_better * 100, 0)} % for ${force}; ` +
+    `alignment ${fixed(c.shadow.alignment * 100, 0)} / ${fixed(c.force.alignment * 100, 0)} %, poses ${fixed(c.distance * 100, 1)} cm apart`;
+};
+
+/// Heights of a card [px]: whole, and with less on it.
+const WHOLE = 234, TIGHT = 190;
+
+/// All cards. `acts` gives commands: choose(car, set), shadow(car, set or null), search(car), open(car), select(car).
 export class Cards {
-  constructor(root, act, select) {
+  constructor(root, acts) {
     this.root = root;
-    this.act = act;
-    this.select = select;
+    this.acts = acts;
     this.cards = new Map();
   }
 
-  update(cars, selected) {
-    this.root.classList.toggle("many", cars.length > 4);
+  update(cars, selected, now) {
+    const [count, room] = [cars.length, this.root.clientHeight];
+    const whole = count * WHOLE <= room, tight = WHOLE + (count - 1) * TIGHT <= room || count <= 3;
+    this.root.classList.toggle("tight", !whole && tight);
+    this.root.classList.toggle("many", !whole && !tight);
     cars.forEach((car, index) => {
       let card = this.cards.get(car.car);
       if (!card) {
-        card = new Card(car.car, index, this.act, this.select);
+        card = new Card(car.car, index, this.acts);
         this.cards.set(car.car, card);
-        this.root.append(card.root);
+        const next = cars.slice(index + 1).map((c) => this.cards.get(c.car)?.root).find(Boolean);
+        this.root.insertBefore(card.root, next ?? null);
       }
-      card.update(car, car.car === selected);
+      card.now = now;
+      card.update(car, index, car.car === selected);
     });
   }
 
+  /// Takes in what the pit wall remembers of each car.
+  remember(history) {
+    for (const card of this.cards.values()) card.history = [];
+    for (const [name, moments] of Object.entries(history)) {
+      const card = this.cards.get(name);
+      if (card) card.history = moments.map((m) => ({ ...m, at: m.at / 1e9, state: m.state.toUpperCase() }));
+    }
+  }
+
+  history(car) { return this.cards.get(car)?.history ?? []; }
   outcome(car, result) { this.cards.get(car)?.outcome(result); }
+
+  /// Takes away a car that is not there any more, as after a jump of a replay.
+  keep(names) {
+    for (const [name, card] of this.cards) {
+      if (!names.includes(name)) {
+        card.root.remove();
+        this.cards.delete(name);
+      }
+    }
+  }
 }
 
 class Card {
-  constructor(name, index, act, select) {
+  constructor(name, index, acts) {
     this.name = name;
-    this.act = act;
+    this.acts = acts;
+    this.history = [];
+    this.said = null;
     this.root = element("article", "card");
     this.root.tabIndex = 0;
     this.root.dataset.car = name;
-    this.root.addEventListener("click", () => select(name));
+    this.root.addEventListener("click", () => acts.select(name));
     this.root.addEventListener("keydown", (event) => {
-      if (event.key === "Enter" && event.target === this.root) select(name);
+      if (event.key === "Enter" && event.target === this.root) acts.select(name);
     });
     const head = element("header");
-    const chip = element("span", "chip");
-    chip.style.background = colourOf(index);
+    this.chip = element("span", "chip");
     this.since = element("span", "for");
     this.state = element("span", "state");
-    head.append(chip, element("span", "name", name), this.state, this.since);
-    this.causes = element("ul", "causes");
+    const open = this.button("⤢", "open this car large (o)", () => acts.open(name));
+    open.className = "open";
+    head.append(this.chip, element("span", "name", name), this.state, this.since, open);
+    this.causes = element("div", "causes");
+    this.brief = element("div", "brief");
     const detail = element("div", "detail");
     const facts = element("div", "facts");
-    this.facts = FACTS.map(([label]) => {
+    this.facts = FACTS.map(([label, , , meaning]) => {
       const cell = element("div");
+      cell.title = meaning;
       const value = element("b");
       cell.append(element("span", "", label), value);
       facts.append(cell);
       return value;
     });
     this.spark = element("canvas", "spark");
-    this.history = [];
+    this.spark.title = "alignment over the last two minutes; the colour is the state";
     this.sets = element("div", "sets");
     this.setButtons = new Map();
-    this.proposal = element("div", "proposal");
-    this.revert = element("div", "revert");
-    this.result = element("p", "outcome");
-    this.result.setAttribute("role", "status");
-    detail.append(facts, this.spark, this.sets, this.revert, this.proposal, this.result);
-    this.root.append(head, this.causes, detail);
+    const note = element("div", "note");
+    this.note = element("p");
+    this.note.setAttribute("role", "status");
+    this.shadow = this.button("shadow", "run another set beside this one, and compare (s)", () => {
+      if (this.car) acts.shadow(name, this.car.shadow ? null : otherSet(this.car));
+    });
+    this.find = this.button("find", "let the car search the whole map (g)", () => acts.search(name));
+    note.append(this.note, this.shadow);
+    detail.append(facts, this.spark, this.sets, note);
+    this.root.append(head, this.causes, this.brief, detail);
   }
 
-  update(car, selected) {
+  button(text, title, act) {
+    const button = element("button", "", text);
+    button.title = title;
+    button.addEventListener("click", (event) => {
+      event.stopPropagation();
+      act();
+    });
+    return button;
+  }
+
+  update(car, index, selected) {
+    this.car = car;
     const [shape, colour] = STATES[car.state] ?? ["?", "none"];
     const className = `card ${colour}${car.blind ? " blind" : ""}${selected ? " selected" : ""}`;
     if (this.root.className !== className) this.root.className = className;
+    if (this.index !== index) { this.index = index; this.chip.style.background = colourOf(index); }
     setText(this.state, `${shape} ${car.state}`);
-    setText(this.since, car.blind ? `silent for ${fixed(car.quiet_s, 0)} s` : `for ${fixed(car.state_for_s, 0)} s`);
-    const causes = car.causes.join("\n");
-    if (this.causes.dataset.text !== causes) {
-      this.causes.dataset.text = causes;
-      this.causes.replaceChildren(...car.causes.map((cause) => element("li", "", cause)));
+    setText(this.since, car.blind ? `silent for ${lasting(car.quiet_s)}` : lasting(car.state_for_s));
+    const causes = car.causes.length > 1 ? `${car.causes[0]}; +${car.causes.length - 1}` : car.causes[0] ?? "";
+    setText(this.causes, causes);
+    if (this.causes.title !== car.causes.join("\n")) this.causes.title = car.causes.join("\n");
+    const hidden = this.root.parentElement?.classList.contains("many") && !selected;
+    if (hidden) {
+      setText(this.brief, [car.set?.name ?? "–", fixed(car.health?.metrics && car.health.metrics.alignment * 100, 0, " %"),
+        fixed(car.pose && car.pose.age_s * 1e3, 0, " ms"), fixed(car.last_lap_s, 2, " s")].join(" · "));
+    } else {
+      FACTS.forEach(([, text, off], i) => {
+        setText(this.facts[i], text(car));
+        this.facts[i].classList.toggle("off", Boolean(off?.(car)));
+      });
+      this.updateSets(car);
+      this.updateNote(car);
     }
-    FACTS.forEach(([, text, off], i) => {
-      setText(this.facts[i], text(car));
-      this.facts[i].classList.toggle("off", Boolean(off?.(car)));
-    });
-    this.updateSets(car);
-    this.updateSpark(car);
+    this.updateSpark(car, !hidden);
   }
 
   updateSets(car) {
@@ -136,22 +220,35 @@ class Card {
       this.sets.dataset.names = key;
       this.setButtons.clear();
       this.sets.replaceChildren(...names.map((name) => {
-        const button = element("button", "", name);
+        const button = this.button(name, `put set ${name} in force`, () => this.choose(name));
         button.dataset.set = name;
-        button.addEventListener("click", (event) => {
-          event.stopPropagation();
-          this.choose(name);
-        });
         this.setButtons.set(name, button);
         return button;
-      }));
+      }), this.find);
     }
-    for (const [name, button] of this.setButtons) button.setAttribute("aria-pressed", String(name === set?.name));
+    const title = set ? `revision ${set.revision}, put in force by ${set.who}` : "";
+    for (const [name, button] of this.setButtons) {
+      const pressed = String(name === set?.name);
+      if (button.getAttribute("aria-pressed") !== pressed) button.setAttribute("aria-pressed", pressed);
+    }
+    if (this.sets.title !== title) this.sets.title = title;
     this.revision = set?.revision ?? null;
-    const revert = set?.reverts_to ? `falls back to ${set.reverts_to} in ${fixed(set.reverts_in_s, 0)} s unless confirmed (c)` : "";
-    setText(this.revert, revert);
-    const proposal = car.health?.proposal;
-    setText(this.proposal, proposal ? `proposes ${proposal.set}: ${proposal.evidence}` : car.health?.auto ? "switches sets by itself" : "");
+  }
+
+  /// One place for what concerns the sets: the answer to the last command for a while, then what the car says.
+  updateNote(car) {
+    setText(this.shadow, car.shadow ? "■ shadow" : "shadow");
+    const set = car.set;
+    const answer = this.said && (this.said.done !== true || performance.now() - this.said.at < 8000) ? this.said : null;
+    let [kind, text] = ["", set ? `${set.name} revision ${set.revision} by ${set.who}` : ""];
+    if (car.health?.auto) text += "; switches by itself";
+    if (car.health?.proposal) [kind, text] = ["warn", `proposes ${car.health.proposal.set}: ${car.health.proposal.evidence}`];
+    if (car.shadow) [kind, text] = ["", verdict(car.shadow)];
+    if (set?.reverts_to) [kind, text] = ["warn", `falls back to ${set.reverts_to} in ${fixed(set.reverts_in_s, 0)} s unless confirmed (c)`];
+    if (answer) [kind, text] = [answer.done === null ? "" : answer.done ? "done" : "failed", (answer.done === null ? "… " : answer.done ? "✓ " : "✗ ") + answer.text];
+    if (this.note.className !== kind) this.note.className = kind;
+    setText(this.note, text);
+    if (this.note.title !== text) this.note.title = text;
   }
 
   /// Puts a set in force, if the one that is seen here still is.
@@ -159,39 +256,25 @@ class Card {
     const button = this.setButtons.get(name);
     if (!button || button.classList.contains("pending")) return;
     button.classList.add("pending");
-    await this.act(this.name, { params: { select: { name, revert_after_ms: null } } }, this.revision);
+    await this.acts.choose(this.name, name, this.revision);
     button.classList.remove("pending");
   }
 
   outcome({ done, text }) {
-    this.result.className = `outcome ${done === null ? "" : done ? "done" : "failed"}`;
-    setText(this.result, (done === null ? "… " : done ? "✓ " : "✗ ") + text);
+    this.said = { done, text: text.replace(`${this.name}: `, ""), at: performance.now() };
+    if (this.car) this.updateNote(this.car);
   }
 
-  /// Alignment over the last minute.
-  updateSpark(car) {
-    const now = performance.now();
-    if (this.history.length && now - this.history.at(-1)[0] < 250) return;
-    const alignment = car.blind ? null : car.health?.metrics?.alignment ?? null;
-    this.history.push([now, alignment, car.state]);
-    while (this.history[0][0] < now - 60e3) this.history.shift();
-    const canvas = this.spark;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    if (!width) return;
-    if (canvas.width !== width) canvas.width = width;
-    if (canvas.height !== height) canvas.height = height;
-    const style = getComputedStyle(document.documentElement);
-    const context = canvas.getContext("2d");
-    context.clearRect(0, 0, width, height);
-    context.lineWidth = 2;
-    for (let i = 1; i < this.history.length; i++) {
-      const [t0, a0] = this.history[i - 1], [t1, a1, state] = this.history[i];
-      if (a0 === null || a1 === null) continue;
-      context.strokeStyle = style.getPropertyValue(`--${(STATES[state] ?? STATES.INIT)[1]}`);
-      context.beginPath();
-      context.moveTo(width - (now - t0) / 60e3 * width, height - 2 - a0 * (height - 4));
-      context.lineTo(width - (now - t1) / 60e3 * width, height - 2 - a1 * (height - 4));
-      context.stroke();
-    }
+  /// Adds this moment to the history, twice a second.
+  updateSpark(car, draw) {
+    const now = this.now;
+    if (!now || (this.history.length && now - this.history.at(-1).at < 0.5)) return;
+    const metrics = car.blind ? null : car.health?.metrics;
+    this.history.push({
+      at: now, state: car.state, alignment: metrics?.alignment ?? null, slip: metrics?.slip ?? null,
+      spread_along: metrics?.spread_along ?? null, spread_across: metrics?.spread_across ?? null,
+    });
+    while (this.history[0].at < now - SPAN_S) this.history.shift();
+    if (draw) plot(this.spark, this.history, now, { value: (p) => p.alignment, low: 0, high: 1, limits: [0.7, 0.45] });
   }
 }

@@ -1,25 +1,48 @@
 // The connection to the pit wall's program: snapshots in, commands out.
 
-/// Calls `onSnapshot` for each snapshot and `onLink` with true or false; dials again for ever.
+/// Without a snapshot for this long, what the page shows is old [ms].
+const SILENT = 1000;
+
+/// Calls `onSnapshot` for each snapshot, and `onLink` with what is known of the connection twice a second and at each
+/// change: {up, silent_s, rate}. Dials again for ever.
 export function connect(onSnapshot, onLink) {
   let socket = null;
-  let selected = null;
+  let wish = { select: null, operator: null };
   let retry = 200;
+  let heard = performance.now();
+  let open = false;
+  let times = [];
   const tell = () => {
-    if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ select: selected }));
+    if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish));
+  };
+  const report = () => {
+    const now = performance.now();
+    while (times.length && times[0] < now - 2000) times.shift();
+    const silent = now - heard;
+    onLink({ up: open && silent < SILENT, silent_s: silent / 1000, rate: times.length / 2 });
   };
   const dial = () => {
     socket = new WebSocket(`ws://${location.host}/ws`);
-    socket.onopen = () => { retry = 200; tell(); onLink(true); };
-    socket.onmessage = (message) => onSnapshot(JSON.parse(message.data));
+    socket.onopen = () => { retry = 200; open = true; heard = performance.now(); tell(); report(); };
+    socket.onmessage = (message) => {
+      const snapshot = JSON.parse(message.data);
+      heard = performance.now();
+      times.push(heard);
+      onSnapshot(snapshot);
+    };
     socket.onclose = () => {
-      onLink(false);
+      open = false;
+      report();
       setTimeout(dial, retry);
       retry = Math.min(retry * 2, 3000);
     };
   };
   dial();
-  return { select(car) { selected = car; tell(); } };
+  setInterval(report, 500);
+  return {
+    select(car) { wish.select = car; tell(); },
+    operator(name) { wish.operator = name; tell(); },
+  };
 }
 
 /// Sends a request; resolves to {ok, status, body}. `body` is JSON where the answer is, else text.

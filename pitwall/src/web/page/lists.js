@@ -1,65 +1,74 @@
 // What happened, the laps, and every number of the selected car.
 
-import { fixed } from "/cards.js";
+import { colourOf, element, fixed, missing } from "/cards.js";
 
 const SEVERITIES = ["info", "warning", "critical"];
 const LONGEST = 500;
 
-const element = (tag, className, text) => {
-  const made = document.createElement(tag);
-  if (className) made.className = className;
-  if (text !== undefined) made.textContent = text;
-  return made;
-};
-
-/// The list of events, with alarms that stay until they are acknowledged.
+/// The list of events, with alarms that stay until somebody acknowledges them, on whichever page.
 export class Log {
-  constructor(list, alarm, filterCar, filterSeverity) {
+  constructor(list, alarm, filterCar, filterSeverity, sound) {
     this.list = list;
     this.alarm = alarm;
     this.filterCar = filterCar;
     this.filterSeverity = filterSeverity;
-    this.entries = [];
-    this.last = 0;
-    this.open = 0;
+    this.sound = sound;
+    this.restart();
     filterCar.addEventListener("change", () => this.redraw());
     filterSeverity.addEventListener("change", () => this.redraw());
   }
 
-  add(entries, first) {
+  /// Takes in new lines; those up to number `acknowledged` are no alarms any more.
+  add(entries, acknowledged, first) {
+    if (acknowledged !== this.acknowledged) {
+      this.acknowledged = acknowledged;
+      for (const line of this.list.querySelectorAll("li.open")) {
+        if (Number(line.dataset.number) <= acknowledged) line.classList.remove("open");
+      }
+    }
+    let alarm = false;
     for (const entry of entries) {
       if (entry.number <= this.last) continue;
       this.last = entry.number;
       this.entries.push(entry);
       if (this.entries.length > LONGEST) this.entries.shift();
-      // What happened before the page was opened is history, not an alarm.
-      entry.fresh = !first && entry.severity === "critical";
-      if (entry.fresh) this.open += 1;
+      alarm ||= !first && this.open(entry);
       if (this.wanted(entry)) this.show(entry);
     }
     while (this.list.children.length > LONGEST) this.list.lastChild.remove();
-    this.showAlarms();
+    if (alarm) this.sound.alarm();
+    const open = this.entries.filter((entry) => this.open(entry)).length;
+    if (open !== this.count) {
+      this.count = open;
+      this.alarm.hidden = open === 0;
+      this.alarm.textContent = open === 1 ? "1 alarm" : `${open} alarms`;
+    }
   }
+
+  open(entry) { return entry.severity === "critical" && entry.number > this.acknowledged; }
 
   /// Adds a line at the top; one that says the same as the one below it is counted there.
   show(entry) {
     const top = this.list.firstChild;
     const text = this.text(entry);
-    if (top && top.dataset.text === text && !entry.fresh) {
+    if (top && top.dataset.text === text && !this.open(entry)) {
       top.dataset.count = Number(top.dataset.count) + 1;
       top.lastChild.textContent = `×${top.dataset.count}`;
       return;
     }
-    const line = element("li", `${entry.severity}${entry.fresh ? " new" : ""}`);
+    const marker = entry.kind === "marker" ? " marker" : "";
+    const line = element("li", `${entry.severity}${this.open(entry) ? " open" : ""}${marker}`);
     line.dataset.text = text;
     line.dataset.count = 1;
+    line.dataset.number = entry.number;
     const time = new Date(entry.at / 1e6).toTimeString().slice(0, 8);
     line.append(element("time", "", time), text, element("b"));
     this.list.prepend(line);
   }
 
   text(entry) {
-    return `${entry.car ?? ""} ${entry.text}${entry.who ? ` [${entry.who}]` : ""}`;
+    const mark = entry.kind === "marker" ? "⚑ " : "";
+    return `${mark}${entry.car ? `${entry.car} ` : ""}${entry.text}${entry.who ? ` [${entry.who}]` : ""}`;
   }
 
   wanted(entry) {
@@ -72,40 +81,74 @@ export class Log {
     for (const entry of this.entries) if (this.wanted(entry)) this.show(entry);
   }
 
-  showAlarms() {
-    this.alarm.hidden = this.open === 0;
-    this.alarm.textContent = this.open === 1 ? "1 alarm" : `${this.open} alarms`;
-  }
-
-  acknowledge() {
-    this.open = 0;
-    for (const entry of this.entries) entry.fresh = false;
+  /// What was said before is void.
+  restart() {
+    this.last = 0;
+    this.entries = [];
+    this.acknowledged = 0;
+    this.count = 0;
+    this.alarm.hidden = true;
     this.redraw();
-    this.showAlarms();
   }
-
-  /// A new page of the program begins a new log.
-  restart() { this.last = 0; this.entries = []; this.redraw(); }
 }
 
-/// Laps of the selected car, the last first.
+const rowOf = (tag, cells) => {
+  const row = element("tr");
+  for (const [text, className, title] of cells) {
+    const cell = element(tag, className, text);
+    if (title) cell.title = title;
+    row.append(cell);
+  }
+  return row;
+};
+
+/// Best and last laps of all cars, the fastest first.
+export function showStandings(table, cars, select) {
+  const known = cars.map((car, index) => ({ ...car, index }));
+  known.sort((a, b) => (a.best_lap_s ?? Infinity) - (b.best_lap_s ?? Infinity));
+  const key = JSON.stringify(known.map((car) => [car.car, car.best_lap_s, car.last_lap_s, car.pose?.lap]));
+  if (table.dataset.key === key) return;
+  table.dataset.key = key;
+  const lead = known[0]?.best_lap_s;
+  const head = element("thead");
+  head.append(rowOf("th", [["", ""], ["car", ""], ["best", "number"], ["behind", "number"], ["last", "number"], ["lap", "number"]]));
+  const body = element("tbody");
+  known.forEach((car) => {
+    const row = rowOf("td", [["", ""], [car.car, ""], [fixed(car.best_lap_s, 3), "number"],
+      [car.best_lap_s ? `+${fixed(car.best_lap_s - lead, 3)}` : "–", "number"], [fixed(car.last_lap_s, 3), "number"], [fixed(car.pose?.lap, 0), "number"]]);
+    const chip = element("span", "chip");
+    chip.style.background = colourOf(car.index);
+    row.firstChild.append(chip);
+    row.addEventListener("click", () => select(car.car));
+    body.append(row);
+  });
+  table.replaceChildren(head, body);
+}
+
+/// Laps of the selected car with their sectors, the last first.
 export function showLaps(table, laps, car) {
-  const key = `${car}:${laps.length}`;
+  const key = `${car}:${laps.length}:${laps.at(-1)?.lap}`;
   if (table.dataset.key === key) return;
   table.dataset.key = key;
   const best = Math.min(...laps.map((lap) => lap.time_s));
-  const row = (tag, className, cells) => {
-    const made = element("tr", className);
-    cells.forEach((text, i) => made.append(element(tag, i === 3 ? "" : "number", text)));
-    return made;
-  };
-  const rows = laps.map((lap) =>
-    row("td", lap.time_s === best ? "best" : "", [String(lap.lap), fixed(lap.time_s, 3), `+${fixed(lap.time_s - best, 3)}`, lap.set]));
-  table.replaceChildren(row("th", "", [`lap of ${car ?? "–"}`, "time s", "to best", "set"]), ...rows.reverse());
+  const sectors = [0, 1, 2].map((i) => Math.min(...laps.map((lap) => lap.sectors_s[i] ?? Infinity)));
+  const head = rowOf("th", [[car ?? "", ""], ["time", "number"], ["to best", "number"], ["S1", "number"], ["S2", "number"], ["S3", "number"], ["set", ""],
+    ["slip", "number", "share of the lap in which wheels slipped by more than 8 %"]]);
+  const rows = laps.map((lap) => {
+    const { grip } = lap;
+    const slips = grip && grip.slipping > 0.1;
+    const about = grip ? `worst slip ${fixed(grip.worst_slip * 100, 0)} %, mean alignment ${fixed(grip.alignment * 100, 0)} %, mean distance from the raceline ${fixed(lap.lateral_m && lap.lateral_m * 100, 1)} cm` : "";
+    return rowOf("td", [
+      [String(lap.lap), "number"], [fixed(lap.time_s, 3), `number${lap.time_s === best ? " best" : ""}`], [`+${fixed(lap.time_s - best, 3)}`, "number"],
+      ...lap.sectors_s.map((s, i) => [fixed(s, 2), `number${s !== null && s === sectors[i] ? " best" : ""}`]),
+      [lap.set, "set", lap.set], [grip ? `${slips ? "▲" : ""}${fixed(grip.slipping * 100, 0)} %` : "–", `number${slips ? " warn" : ""}`, about],
+    ]);
+  });
+  table.replaceChildren(head, ...rows.reverse());
 }
 
 /// Every number that the selected car has sent.
-export function showNumbers(table, car) {
+export function showNumbers(table, car, pace) {
   const rows = [];
   const add = (name, value) => rows.push([name, value]);
   if (car) {
@@ -114,6 +157,7 @@ export function showNumbers(table, car) {
       add("heading", fixed(car.pose.heading_rad * 180 / Math.PI, 1, "°"));
       add("s, d", `${fixed(car.pose.s_m, 2)}, ${fixed(car.pose.d_m, 3)} m`);
     }
+    if (car.set) add("set", `${car.set.name}, revision ${car.set.revision} by ${car.set.who}`);
     for (const [name, value] of Object.entries(car.health?.metrics ?? {})) add(name.replaceAll("_", " "), fixed(value, name === "particles" ? 0 : 3));
     if (car.load) {
       add("update p50 / p99 / max", ["p50", "p99", "max"].map((k) => fixed(car.load.update_us[k] / 1e3, 2)).join(" / ") + " ms");
@@ -124,6 +168,7 @@ export function showNumbers(table, car) {
       for (const [name, count] of Object.entries(car.load.drops)) if (count) add(`dropped: ${name.replaceAll("_", " ")}`, String(count));
     }
     add("clock offset", fixed(car.clock_offset_s && car.clock_offset_s * 1e3, 2, " ms"));
+    add("missing", String(missing(car)));
     for (const [topic, s] of Object.entries(car.streams)) {
       add(topic, `${fixed(s.rate_hz, 1)} /s, missing ${s.missing}${s.filled_late ? `, late ${s.filled_late}` : ""}${s.unreadable ? `, unreadable ${s.unreadable}` : ""}`);
     }
@@ -133,9 +178,6 @@ export function showNumbers(table, car) {
       add("version, host", `${car.info.version}, ${car.info.host}`);
     }
   }
-  table.replaceChildren(...rows.map(([name, value]) => {
-    const row = element("tr");
-    row.append(element("th", "", name), element("td", "", value));
-    return row;
-  }));
+  add("this page", pace);
+  table.replaceChildren(...rows.map(([name, value]) => rowOf("td", [[name, "quiet"], [value, ""]])));
 }

@@ -1,9 +1,31 @@
 // The track: map, raceline, cars with trail and spread, particles and end points of the selected car.
 
-import { STATES, colourOf } from "/cards.js";
+import { STATES, colourOf, fixed } from "/cards.js";
 
 const TRAIL_S = 12;
-const END_POINTS = ["--good", "--quiet", "--warn", "--bad"];
+const END_POINTS = ["good", "quiet", "warn", "bad"];
+
+let colours = null;
+/// The theme's colours. Asking the browser for each would take longer than drawing.
+export function palette() {
+  const theme = document.documentElement.dataset.theme;
+  if (colours?.theme !== theme) {
+    const style = getComputedStyle(document.documentElement);
+    colours = { theme };
+    for (const name of ["good", "busy", "warn", "bad", "none", "ground", "text", "quiet", "edge", "wall", "unknown", "free", "line"]) {
+      colours[name] = style.getPropertyValue(`--${name}`).trim();
+    }
+  }
+  return colours;
+}
+
+/// What can be painted along the track: name, colour of a place, legend.
+const PAINTS = {
+  off: null,
+  state: [(p) => (STATES[p.state.toUpperCase()] ?? STATES.INIT)[1], [["good", "localized"], ["warn", "degraded"], ["bad", "lost, stale"], ["busy", "searching"]]],
+  alignment: [(p) => (p.alignment > 0.7 ? "good" : p.alignment > 0.45 ? "warn" : "bad"), [["good", "> 70 %"], ["warn", "> 45 %"], ["bad", "less"]]],
+  slip: [(p) => (Math.abs(p.slip) <= 0.08 ? "good" : Math.abs(p.slip) <= 0.2 ? "warn" : "bad"), [["good", "≤ 8 %"], ["warn", "≤ 20 %"], ["bad", "more"]]],
+};
 
 export class Track {
   /// `placed(x, y, heading)` is called when a pose was dragged, `picked(number)` when a candidate was clicked.
@@ -20,6 +42,9 @@ export class Track {
     this.placing = false;
     this.drag = null;
     this.candidates = [];
+    this.paint = "off";
+    this.strips = new Map();
+    this.size = "";
     this.snapshot = null;
     this.selected = null;
     canvas.addEventListener("pointerdown", (e) => this.pressed(e));
@@ -46,6 +71,8 @@ export class Track {
         this.trails.set(car.car, trail);
       }
     }
+    const { selected: details } = snapshot;
+    if (details?.strip) this.strips.set(details.car, details.strip);
     for (const car of snapshot.maps) {
       if (!this.maps.has(car) && !this.fetching.has(car)) this.fetchMap(car);
     }
@@ -53,6 +80,20 @@ export class Track {
       this.asked = true;
       requestAnimationFrame(() => { this.asked = false; this.draw(); });
     }
+  }
+
+  /// Another epoch: what was known is void, but for the maps.
+  restart() {
+    this.trails.clear();
+    this.strips.clear();
+    this.candidates = [];
+  }
+
+  /// Paints something else along the track; returns its name and legend.
+  paintNext() {
+    const names = Object.keys(PAINTS);
+    this.paint = names[(names.indexOf(this.paint) + 1) % names.length];
+    return [this.paint, PAINTS[this.paint]?.[1] ?? []];
   }
 
   async fetchMap(car) {
@@ -67,12 +108,12 @@ export class Track {
 
   /// Draws the grid once for each theme.
   image(map) {
-    const theme = document.documentElement.dataset.theme;
+    const themed = palette();
+    const { theme } = themed;
     map.images ??= {};
     if (map.images[theme]) return map.images[theme];
-    const style = getComputedStyle(document.documentElement);
-    const colour = (name) => style.getPropertyValue(name).trim().match(/[0-9a-f]{2}/gi).map((h) => parseInt(h, 16));
-    const colours = [colour("--free"), colour("--wall"), colour("--unknown")];
+    const colour = (name) => themed[name].match(/[0-9a-f]{2}/gi).map((h) => parseInt(h, 16));
+    const colours = [colour("free"), colour("wall"), colour("unknown")];
     const image = new OffscreenCanvas(map.width, map.height);
     const context = image.getContext("2d");
     const pixels = context.createImageData(map.width, map.height);
@@ -103,10 +144,13 @@ export class Track {
       points = [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => [x + c * u - s * v, y + s * u + c * v]);
     }
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
-    const [left, right, low, high] = [Math.min(...xs) - 2, Math.max(...xs) + 2, Math.min(...ys) - 2, Math.max(...ys) + 2];
-    const scale = Math.min(width / (right - left), height / (high - low));
-    this.view = { x: (left + right) / 2, y: (low + high) / 2, scale };
+    const [left, right, low, high] = [Math.min(...xs) - 1.6, Math.max(...xs) + 1.6, Math.min(...ys) - 1.6, Math.max(...ys) + 1.6];
+    // The tools take the lowest part.
+    const tools = 48;
+    const scale = Math.min(width / (right - left), (height - tools) / (high - low));
+    this.view = { x: (left + right) / 2, y: (low + high) / 2 - tools / 2 / scale, scale };
     this.fitted = true;
+    this.handled = false;
   }
 
   /// Zooms about a point of the canvas [px].
@@ -114,6 +158,7 @@ export class Track {
     if (!this.view) return;
     const [x, y] = this.toMap(px, py);
     this.view.scale = Math.min(Math.max(this.view.scale * factor, 1), 2000);
+    this.handled = true;
     const [x2, y2] = this.toMap(px, py);
     this.view.x += x - x2;
     this.view.y += y - y2;
@@ -149,6 +194,7 @@ export class Track {
     if (!this.placing) {
       const { from, to, view } = this.drag;
       this.follow = false;
+      this.handled = true;
       this.view.x = view.x - (to[0] - from[0]) / view.scale;
       this.view.y = view.y + (to[1] - from[1]) / view.scale;
     }
@@ -171,19 +217,24 @@ export class Track {
     if (!width || !this.snapshot) return;
     if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
     if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
-    const style = getComputedStyle(document.documentElement);
-    const colour = (name) => style.getPropertyValue(name).trim();
+    const colour = palette();
     const context = canvas.getContext("2d");
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.fillStyle = colour("--unknown");
+    context.fillStyle = colour.unknown;
     context.fillRect(0, 0, width, height);
     const map = this.map();
+    // Until somebody zooms or pans, the whole track stays in view, also when the window changes.
+    if (this.size !== `${width} ${height}`) {
+      this.size = `${width} ${height}`;
+      if (!this.handled) this.fitted = false;
+    }
     if (!this.fitted) this.fit();
     if (!this.view && this.snapshot.cars[0]?.pose) {
       this.view = { x: this.snapshot.cars[0].pose.x_m, y: this.snapshot.cars[0].pose.y_m, scale: 30 };
     }
     if (!this.view) return;
     const followed = this.snapshot.cars.find((car) => car.car === this.selected)?.pose;
+    if (this.follow && followed) this.handled = true;
     if (this.follow && followed) Object.assign(this.view, { x: followed.x_m, y: followed.y_m });
 
     // From here on in metres of `map`, y up.
@@ -192,13 +243,14 @@ export class Track {
     context.setTransform(ratio * scale, 0, 0, -ratio * scale, ratio * ox, ratio * oy);
     const pixel = 1 / scale;
     if (map) this.drawMap(context, map, pixel, colour);
+    if (map && PAINTS[this.paint]) this.drawStrip(context, map, pixel, colour);
     this.snapshot.cars.forEach((car, i) => this.drawTrail(context, car, pixel, colour));
     const selected = this.snapshot.selected;
     if (selected && selected.car === this.selected) this.drawSelected(context, selected, pixel, colour);
     this.snapshot.cars.forEach((car, i) => this.drawCar(context, car, i, pixel, colour));
     for (const candidate of this.candidates) this.drawCandidate(context, candidate, pixel, colour);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.snapshot.cars.forEach((car, i) => this.drawName(context, car, i, colour));
+    this.drawNames(context, colour);
     if (this.drag && this.placing) this.drawPlacing(context, colour);
   }
 
@@ -216,32 +268,62 @@ export class Track {
       points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
       context.closePath();
       context.setLineDash([8 * pixel, 6 * pixel]);
-      context.strokeStyle = colour("--line");
+      context.strokeStyle = colour.line;
       context.lineWidth = 1.5 * pixel;
       context.stroke();
       context.setLineDash([]);
     }
   }
 
-  /// Where the car has been, in the colours of its state then.
+  /// The selected car's lap, place by place, as it was the last time it was there.
+  drawStrip(context, map, pixel, colour) {
+    const strip = this.strips.get(this.selected);
+    const line = map.raceline?.points ?? [];
+    if (!strip?.length || line.length < 3) return;
+    const [colourOfPlace] = PAINTS[this.paint];
+    context.lineWidth = Math.max(0.3, 7 * pixel);
+    context.globalAlpha = 0.55;
+    strip.forEach((place, i) => {
+      if (!place) return;
+      const [from, to] = [i, i + 1].map((k) => Math.round(k / strip.length * line.length));
+      context.strokeStyle = colour[colourOfPlace(place)];
+      context.beginPath();
+      for (let k = from; k <= to; k++) {
+        const [x, y] = line[k % line.length];
+        if (k === from) context.moveTo(x, y); else context.lineTo(x, y);
+      }
+      context.stroke();
+    });
+    context.globalAlpha = 1;
+  }
+
+  /// Where the car has been, in the colours of its state then: old parts fainter, in a few steps.
   drawTrail(context, car, pixel, colour) {
     const trail = this.trails.get(car.car) ?? [];
+    const now = this.snapshot.now / 1e9;
     context.lineWidth = 3 * pixel;
+    let style = "";
     for (let i = 1; i < trail.length; i++) {
       const [x0, y0] = trail[i - 1], [x1, y1, state, at] = trail[i];
-      if (Math.hypot(x1 - x0, y1 - y0) > 2) continue;
-      context.globalAlpha = Math.max(0, 0.8 * (1 - (this.snapshot.now / 1e9 - at) / TRAIL_S));
-      context.strokeStyle = colour(`--${(STATES[state] ?? STATES.INIT)[1]}`);
-      context.beginPath();
-      context.moveTo(x0, y0);
-      context.lineTo(x1, y1);
-      context.stroke();
+      const jump = Math.hypot(x1 - x0, y1 - y0) > 2;
+      const fresh = Math.ceil(6 * (1 - (now - at) / TRAIL_S));
+      const next = `${state} ${fresh}`;
+      if (next !== style || jump) {
+        if (style) context.stroke();
+        style = next;
+        context.globalAlpha = Math.min(Math.max(0.8 * fresh / 6, 0), 1);
+        context.strokeStyle = colour[(STATES[state] ?? STATES.INIT)[1]];
+        context.beginPath();
+        context.moveTo(jump ? x1 : x0, jump ? y1 : y0);
+      }
+      if (!jump) context.lineTo(x1, y1);
     }
+    if (style) context.stroke();
     context.globalAlpha = 1;
   }
 
   drawSelected(context, { particles, end_points: endPoints }, pixel, colour) {
-    context.fillStyle = colour("--busy");
+    context.fillStyle = colour.busy;
     const size = 1.5 * pixel;
     for (const [x, y, , weight] of particles) {
       context.globalAlpha = 0.15 + 0.6 * weight;
@@ -250,7 +332,7 @@ export class Track {
     context.globalAlpha = 1;
     const point = 2 * pixel;
     for (const [x, y, kind] of endPoints) {
-      context.fillStyle = colour(END_POINTS[kind] ?? "--quiet");
+      context.fillStyle = colour[END_POINTS[kind] ?? "quiet"];
       context.fillRect(x - point, y - point, 2 * point, 2 * point);
     }
   }
@@ -279,31 +361,41 @@ export class Track {
     context.lineTo(-0.02, 0);
     context.lineTo(-0.1, -0.16);
     context.closePath();
-    context.fillStyle = car.blind ? colour("--none") : colourOf(index);
+    context.fillStyle = car.blind ? colour.none : colourOf(index);
     context.fill();
     context.lineWidth = 2 * pixel / size;
-    context.strokeStyle = colour(`--${(STATES[car.state] ?? STATES.INIT)[1]}`);
+    context.strokeStyle = colour[(STATES[car.state] ?? STATES.INIT)[1]];
     context.stroke();
     context.restore();
     context.globalAlpha = 1;
   }
 
-  drawName(context, car, index, colour) {
-    if (!car.pose) return;
-    const [px, py] = this.toCanvas(car.pose.x_m, car.pose.y_m);
-    context.font = `${car.car === this.selected ? "700 " : ""}13px system-ui, sans-serif`;
-    context.lineWidth = 3;
-    context.strokeStyle = colour("--ground");
-    const label = `${(STATES[car.state] ?? ["?"])[0]} ${car.car}`;
-    context.strokeText(label, px + 14, py - 10);
-    context.fillStyle = car.blind ? colour("--none") : colourOf(index);
-    context.fillText(label, px + 14, py - 10);
+  /// Names beside the cars, one below the other where cars are close.
+  drawNames(context, colour) {
+    const placed = [];
+    context.lineWidth = 4;
+    context.strokeStyle = colour.ground;
+    this.snapshot.cars.forEach((car, index) => {
+      if (!car.pose) return;
+      const [px, py] = this.toCanvas(car.pose.x_m, car.pose.y_m);
+      const chosen = car.car === this.selected;
+      context.font = `${chosen ? "700 14px" : "13px"} system-ui, sans-serif`;
+      const silent = car.blind ? ` ${fixed(car.quiet_s, 0)} s` : "";
+      const label = `${(STATES[car.state] ?? ["?"])[0]} ${car.car}${silent}`;
+      const [x, width] = [px + 14, context.measureText(label).width];
+      let y = py - 10;
+      while (placed.some((other) => Math.abs(other.y - y) < 15 && x < other.x + other.width + 4 && other.x < x + width + 4)) y -= 15;
+      placed.push({ x, y, width });
+      context.strokeText(label, x, y);
+      context.fillStyle = car.blind ? colour.none : colour.text;
+      context.fillText(label, x, y);
+    });
   }
 
   drawCandidate(context, { pose, number, score }, pixel, colour) {
     context.save();
     context.translate(pose.x, pose.y);
-    context.strokeStyle = colour("--warn");
+    context.strokeStyle = colour.warn;
     context.lineWidth = 2 * pixel;
     context.beginPath();
     context.arc(0, 0, 12 * pixel, 0, 2 * Math.PI);
@@ -312,15 +404,15 @@ export class Track {
     context.stroke();
     context.scale(pixel, -pixel);
     context.font = "700 13px system-ui, sans-serif";
-    context.fillStyle = colour("--warn");
+    context.fillStyle = colour.warn;
     context.fillText(`${number}: ${Math.round(score * 100)} %`, 14, -14);
     context.restore();
   }
 
   drawPlacing(context, colour) {
     const { from, to } = this.drag;
-    context.strokeStyle = colour("--warn");
-    context.fillStyle = colour("--warn");
+    context.strokeStyle = colour.warn;
+    context.fillStyle = colour.warn;
     context.lineWidth = 3;
     context.beginPath();
     context.moveTo(...from);

@@ -1,0 +1,130 @@
+//! Where events arrive: the fleet, a recording that may be going on, and whoever else listens.
+//!
+//! Live events and a replay's go the same way, [`Board::take`].
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crossbeam_channel::{Receiver, Sender, TrySendError};
+
+use crate::event::{FleetEvent, Happening};
+use crate::fleet::Fleet;
+use crate::recording::{Progress, Recorder};
+
+/// The state of all cars, shared by those who fill it and those who show it.
+#[derive(Default)]
+pub struct Board {
+    state: Mutex<State>,
+    recorder: Mutex<Option<Recorder>>,
+    taps: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
+}
+
+#[derive(Default)]
+struct State {
+    fleet: Fleet,
+    epoch: u64,
+}
+
+/// The fleet, held. What comes in meanwhile waits.
+pub struct FleetGuard<'a>(MutexGuard<'a, State>);
+
+impl std::ops::Deref for FleetGuard<'_> {
+    type Target = Fleet;
+
+    fn deref(&self) -> &Fleet {
+        &self.0.fleet
+    }
+}
+
+impl std::ops::DerefMut for FleetGuard<'_> {
+    fn deref_mut(&mut self) -> &mut Fleet {
+        &mut self.0.fleet
+    }
+}
+
+impl FleetGuard<'_> {
+    /// Counts how often the fleet was begun anew.
+    pub fn epoch(&self) -> u64 {
+        self.0.epoch
+    }
+}
+
+impl Board {
+    /// What is known. Hold it briefly.
+    pub fn fleet(&self) -> FleetGuard<'_> {
+        FleetGuard(self.state.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Takes in an event and hands it on to the recorder and to all taps.
+    pub fn take(&self, event: FleetEvent) {
+        self.fleet().apply(&event);
+        let event = Arc::new(event);
+        if let Some(recorder) = &*self.recorder() {
+            recorder.take(&event);
+        }
+        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
+        taps.retain(|tap| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))));
+    }
+
+    /// Puts `fleet` in place of what was known: a replay has jumped.
+    pub fn restart(&self, fleet: Fleet) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.fleet = fleet;
+        state.epoch += 1;
+    }
+
+    /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
+    pub fn tap(&self, now: i64) -> Receiver<Arc<FleetEvent>> {
+        const WAITING: usize = 20_000;
+        let (tap, events) = crossbeam_channel::bounded(WAITING);
+        for event in self.known(now) {
+            drop(tap.try_send(Arc::new(event)));
+        }
+        self.taps.lock().unwrap_or_else(PoisonError::into_inner).push(tap);
+        events
+    }
+
+    /// The file that is being recorded into, and how that is getting on.
+    pub fn recording(&self) -> Option<(PathBuf, Progress)> {
+        let recorder = self.recorder();
+        recorder
+            .as_ref()
+            .map(|recorder| (recorder.path().to_owned(), recorder.progress()))
+    }
+
+    /// The recording that is going on.
+    pub(crate) fn recorder(&self) -> MutexGuard<'_, Option<Recorder>> {
+        self.recorder.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What a recording that begins at `at` [unix ns] would otherwise not know.
+    pub(crate) fn known(&self, at: i64) -> Vec<FleetEvent> {
+        let fleet = self.fleet();
+        let mut events = Vec::new();
+        for car in fleet.cars() {
+            let mut push = |happening| {
+                events.push(FleetEvent {
+                    at,
+                    car: car.name.clone(),
+                    happening,
+                });
+            };
+            if car.alive {
+                push(Happening::Appeared);
+            }
+            if let Some((map, bytes)) = &car.map {
+                push(Happening::Map {
+                    map: map.clone(),
+                    bytes: bytes.clone(),
+                });
+            }
+            if let Some(info) = &car.info {
+                push(Happening::Info(info.clone()));
+            }
+            if let Some((offset, round_trip)) = car.clock() {
+                push(Happening::Clock { offset, round_trip });
+            }
+        }
+        events
+    }
+}

@@ -1,0 +1,43 @@
+//! `pitwall replay`
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use pitwall::{Page, PageOptions, Replay};
+use serde_json::json;
+
+use super::interrupted;
+use crate::output;
+
+pub(super) async fn run(
+    file: &Path,
+    options: PageOptions,
+    speed: f64,
+    at_s: f64,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let path = file.to_owned();
+    // Looking through a long recording takes a while.
+    let replay = tokio::task::spawn_blocking(move || Replay::start(&path)).await??;
+    replay
+        .steer(None, Some(speed), (at_s != 0.0).then_some(at_s))
+        .map_err(|fault| anyhow::anyhow!("{fault}"))?;
+    let address = options.address;
+    let page = Page::serve_replay(replay.clone(), options)
+        .await
+        .map_err(|error| anyhow::anyhow!("cannot serve the page at {address}: {error}"))?;
+    let duration = replay.view().duration_s;
+    if json {
+        output::say_json(&json!({"page": page.url(), "duration_s": duration}))?;
+    } else {
+        output::say(&format!(
+            "replay of {}, {duration:.1} s: {}\nCtrl-C ends it",
+            file.display(),
+            page.url()
+        ));
+    }
+    interrupted().await;
+    page.stop().await;
+    replay.stop();
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,334 @@
+//! Laps with their sectors, and what each was like.
+//!
+//! A car tells when a lap ended and how long it took. Where the lap's time went, the pit wall reads off the poses:
+//! the moments at which `s` passes each third of the raceline, between two poses by the straight line.
+
+use std::collections::VecDeque;
+
+use protocol::Metrics;
+use serde::Serialize;
+
+/// Sectors of a lap, of equal length along the raceline.
+pub const SECTORS: usize = 3;
+
+/// A lap that was driven.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Lap {
+    /// Its number, from 1.
+    pub lap: u32,
+    /// Its time [s].
+    pub time_s: f64,
+    /// The set in force at its end.
+    pub set: String,
+    /// Times of its sectors [s]; None where poses are missing.
+    pub sectors_s: [Option<f64>; SECTORS],
+    /// What it was like; None when no health message came during it.
+    pub grip: Option<LapGrip>,
+    /// Mean distance from the raceline, by the car's own estimate [m]; None without poses.
+    pub lateral_m: Option<f64>,
+}
+
+/// How the wheels gripped during a lap, and how well scans fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LapGrip {
+    /// Share of the lap in which wheels slipped by more than [`LapGrip::SLIPS`], in `[0, 1]`.
+    pub slipping: f64,
+    /// The worst slip, without its sign.
+    pub worst_slip: f64,
+    /// Mean alignment, in `[0, 1]`.
+    pub alignment: f64,
+}
+
+impl LapGrip {
+    /// From here on wheels slip: the health monitor's limit for a warning.
+    pub const SLIPS: f32 = 0.08;
+}
+
+/// All laps of one car.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct LapBook {
+    laps: Vec<Lap>,
+    /// Laps under way or just ended, the newest last.
+    traces: VecDeque<Trace>,
+    last: Option<Passed>,
+}
+
+/// A pose on the raceline.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Passed {
+    /// When it was true [unix ns].
+    pub(crate) at: i64,
+    /// Along the raceline [m].
+    pub(crate) s: f64,
+    /// Off the raceline [m].
+    pub(crate) d: f64,
+    /// Laps begun.
+    pub(crate) lap: u32,
+}
+
+/// What is known of a lap before it has ended.
+#[derive(Debug, Clone, Default)]
+struct Trace {
+    lap: u32,
+    /// When it began [unix ns]; None when that was not seen.
+    begun: Option<i64>,
+    /// When each border between two sectors was passed [unix ns].
+    borders: [Option<i64>; SECTORS - 1],
+    poses: u32,
+    lateral: f64,
+    healths: u32,
+    slipping: u32,
+    worst_slip: f32,
+    alignment: f64,
+}
+
+impl LapBook {
+    /// Most laps kept.
+    const MAX_LAPS: usize = 500;
+    /// Laps that may wait for their end to be told.
+    const MAX_TRACES: usize = 4;
+    /// A step from one pose to the next that takes longer is a gap [ns].
+    const GAP: i64 = 1_000_000_000;
+
+    pub(crate) fn laps(&self) -> &[Lap] {
+        &self.laps
+    }
+
+    /// Takes in a pose on a raceline of `length` [m].
+    pub(crate) fn on_pose(&mut self, here: Passed, length: f64) {
+        let before = self.last.replace(here);
+        // A car that starts again counts its laps from the beginning.
+        if self.traces.back().is_some_and(|trace| trace.lap > here.lap) {
+            self.traces.clear();
+        }
+        let step = before.and_then(|before| Step::between(before, here, length));
+        if self.traces.back().is_none_or(|trace| trace.lap != here.lap) {
+            if self.traces.len() == Self::MAX_TRACES {
+                self.traces.pop_front();
+            }
+            self.traces.push_back(Trace {
+                lap: here.lap,
+                begun: step
+                    .filter(|step| step.over_line)
+                    .and_then(|step| step.when(length)),
+                ..Trace::default()
+            });
+        }
+        let Some(trace) = self.traces.back_mut() else {
+            return;
+        };
+        trace.poses += 1;
+        trace.lateral += here.d.abs();
+        if let Some(step) = step {
+            for (i, border) in trace.borders.iter_mut().enumerate() {
+                let at = length * (i + 1) as f64 / SECTORS as f64;
+                // After the line the step ends beyond a lap's length.
+                let passed = step.when(at).or_else(|| step.when(at + length));
+                if border.is_none() {
+                    *border = passed;
+                }
+            }
+        }
+    }
+
+    /// Takes in what was measured just now.
+    pub(crate) fn on_metrics(&mut self, metrics: &Metrics) {
+        if let Some(trace) = self.traces.back_mut() {
+            trace.healths += 1;
+            trace.slipping += u32::from(metrics.slip.abs() > LapGrip::SLIPS);
+            trace.worst_slip = trace.worst_slip.max(metrics.slip.abs());
+            trace.alignment += f64::from(metrics.alignment);
+        }
+    }
+
+    /// Takes in that a lap has ended.
+    pub(crate) fn on_lap(&mut self, lap: u32, time_s: f64, set: &str) {
+        let at = self.traces.iter().position(|trace| trace.lap == lap);
+        let trace = at.map(|at| &self.traces[at]);
+        // The news may be faster than the first pose of the next lap.
+        let next = at.and_then(|at| self.traces.get(at + 1));
+        let told = |begun: i64| begun + (time_s * 1e9) as i64;
+        let end = next
+            .and_then(|next| next.begun)
+            .or_else(|| trace.and_then(|trace| trace.begun).map(told));
+        let mut sectors_s = [None; SECTORS];
+        if let Some(trace) = trace {
+            let marks: Vec<Option<i64>> = std::iter::once(trace.begun)
+                .chain(trace.borders)
+                .chain([end])
+                .collect();
+            for (sector, pair) in sectors_s.iter_mut().zip(marks.windows(2)) {
+                *sector = match pair {
+                    [Some(from), Some(to)] if to > from => Some((to - from) as f64 * 1e-9),
+                    _ => None,
+                };
+            }
+        }
+        if self.laps.len() == Self::MAX_LAPS {
+            self.laps.remove(0);
+        }
+        self.laps.push(Lap {
+            lap,
+            time_s,
+            set: set.to_owned(),
+            sectors_s,
+            grip: trace.and_then(Trace::grip),
+            lateral_m: trace
+                .filter(|trace| trace.poses > 0)
+                .map(|trace| trace.lateral / f64::from(trace.poses)),
+        });
+    }
+}
+
+impl Trace {
+    fn grip(&self) -> Option<LapGrip> {
+        let share = |sum: f64| sum / f64::from(self.healths);
+        (self.healths > 0).then(|| LapGrip {
+            slipping: share(f64::from(self.slipping)),
+            worst_slip: f64::from(self.worst_slip),
+            alignment: share(self.alignment),
+        })
+    }
+}
+
+/// From one pose to the next, forwards.
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    from: (i64, f64),
+    /// `s` here may exceed a lap's length.
+    to: (i64, f64),
+    over_line: bool,
+}
+
+impl Step {
+    /// None for a jump, a pause, and for driving backwards.
+    fn between(before: Passed, here: Passed, length: f64) -> Option<Self> {
+        let mut ahead = here.s - before.s;
+        let over_line = ahead < -length / 2.0;
+        if over_line {
+            ahead += length;
+        }
+        let in_time = (1..=LapBook::GAP).contains(&(here.at - before.at));
+        (in_time && ahead > 0.0 && ahead < length / 4.0).then_some(Self {
+            from: (before.at, before.s),
+            to: (here.at, before.s + ahead),
+            over_line,
+        })
+    }
+
+    /// When `s` was passed [unix ns]; None if it was not.
+    fn when(&self, s: f64) -> Option<i64> {
+        let (from, to) = (self.from, self.to);
+        (from.1 < s && s <= to.1)
+            .then(|| from.0 + ((s - from.1) / (to.1 - from.1) * (to.0 - from.0) as f64) as i64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LENGTH: f64 = 30.0;
+
+    /// Drives at 40 poses a second: 5 m/s in the first sector, 10 in the second, 2.5 in the third.
+    fn drive(book: &mut LapBook, laps: u32) {
+        let (mut s, mut at, mut lap) = (29.0, 0, 0);
+        while lap < laps + 1 {
+            book.on_pose(Passed { at, s, d: -0.1, lap }, LENGTH);
+            let speed = [5.0, 10.0, 2.5][(s / 10.0) as usize % SECTORS];
+            s += speed / 40.0;
+            at += 25_000_000;
+            if s >= LENGTH {
+                s -= LENGTH;
+                lap += 1;
+            }
+        }
+        book.on_pose(Passed { at, s, d: -0.1, lap }, LENGTH);
+    }
+
+    #[test]
+    fn sectors_add_up_to_the_lap() {
+        let mut book = LapBook::default();
+        drive(&mut book, 2);
+        book.on_lap(2, 7.0, "hq");
+        let lap = &book.laps()[0];
+        let sectors: Vec<f64> = lap.sectors_s.iter().map(|s| s.expect("driven")).collect();
+        // Speeds change with the pose after a border: half a step, or 12.5 ms, to either side.
+        for (sector, expected) in sectors.iter().zip([2.0, 1.0, 4.0]) {
+            assert!((sector - expected).abs() < 0.03, "{sectors:?}");
+        }
+        assert!((sectors.iter().sum::<f64>() - 7.0).abs() < 0.03, "{sectors:?}");
+        assert!(lap.lateral_m.is_some_and(|d| (d - 0.1).abs() < 1e-9));
+        assert_eq!(lap.grip, None);
+    }
+
+    #[test]
+    fn a_lap_whose_news_comes_first_has_its_last_sector() {
+        let mut book = LapBook::default();
+        drive(&mut book, 1);
+        let begun_two = book.traces.back().expect("a lap").lap;
+        book.traces.pop_back();
+        book.on_lap(begun_two - 1, 7.0, "hq");
+        assert!(book.laps()[0].sectors_s.iter().all(Option::is_some));
+    }
+
+    #[test]
+    fn a_jump_passes_no_border() {
+        let mut book = LapBook::default();
+        book.on_pose(
+            Passed {
+                at: 0,
+                s: 5.0,
+                d: 0.0,
+                lap: 1,
+            },
+            LENGTH,
+        );
+        book.on_pose(
+            Passed {
+                at: 25_000_000,
+                s: 15.0,
+                d: 0.0,
+                lap: 1,
+            },
+            LENGTH,
+        );
+        book.on_pose(
+            Passed {
+                at: 9_000_000_000,
+                s: 16.0,
+                d: 0.0,
+                lap: 1,
+            },
+            LENGTH,
+        );
+        book.on_lap(1, 9.0, "lq");
+        assert_eq!(book.laps()[0].sectors_s, [None; SECTORS]);
+    }
+
+    #[test]
+    fn slip_is_told_as_a_share_of_the_lap() {
+        let mut book = LapBook::default();
+        book.on_pose(
+            Passed {
+                at: 0,
+                s: 5.0,
+                d: 0.0,
+                lap: 1,
+            },
+            LENGTH,
+        );
+        for slip in [0.0, 0.05, -0.3, 0.1] {
+            let alignment = 0.8;
+            book.on_metrics(&Metrics {
+                slip,
+                alignment,
+                ..Metrics::default()
+            });
+        }
+        book.on_lap(1, 9.0, "lq");
+        let grip = book.laps()[0].grip.expect("told");
+        assert!((grip.slipping - 0.5).abs() < 1e-9 && (grip.worst_slip - 0.3).abs() < 1e-6);
+        assert!((grip.alignment - 0.8).abs() < 1e-6);
+    }
+}

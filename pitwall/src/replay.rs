@@ -1,0 +1,234 @@
+//! A recording, played back as if the cars were there: the same events through the same fleet.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use crate::board::Board;
+use crate::event::FleetEvent;
+use crate::fleet::Fleet;
+use crate::recording::{RecordingError, read_events};
+
+/// A recording being played.
+pub struct Replay {
+    board: Arc<Board>,
+    path: PathBuf,
+    /// When its first and its last event arrived [unix ns].
+    span: (i64, i64),
+    wheel: Mutex<Wheel>,
+    turned: Condvar,
+}
+
+/// Where it is and how it moves.
+struct Wheel {
+    playing: bool,
+    speed: f64,
+    /// The moment of the recording that was shown at `since` [unix ns].
+    at: i64,
+    since: Instant,
+    /// A jump that has not been made yet [unix ns].
+    jump: Option<i64>,
+    stop: bool,
+}
+
+/// How a replay is getting on.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReplayView {
+    /// The file.
+    pub file: String,
+    /// False while it is paused, and at the end.
+    pub playing: bool,
+    /// Times real time.
+    pub speed: f64,
+    /// Since the recording's begin [s].
+    pub at_s: f64,
+    /// From its begin to its end [s].
+    pub duration_s: f64,
+}
+
+impl Wheel {
+    fn now(&self, end: i64) -> i64 {
+        if !self.playing {
+            return self.at.min(end);
+        }
+        let ahead = self.since.elapsed().as_secs_f64() * self.speed * 1e9;
+        self.at.saturating_add(ahead as i64).min(end)
+    }
+
+    /// Notes where it is, before something changes.
+    fn settle(&mut self, end: i64) {
+        self.at = self.now(end);
+        self.since = Instant::now();
+    }
+}
+
+impl Replay {
+    /// Fastest and slowest [times real time].
+    pub const SPEEDS: std::ops::RangeInclusive<f64> = 0.1..=50.0;
+
+    /// Looks through the whole recording, so that what is wrong with it is known before it is shown, and begins to
+    /// play it on a thread of its own.
+    pub fn start(path: &Path) -> Result<Arc<Self>, RecordingError> {
+        let mut span: Option<(i64, i64)> = None;
+        for event in read_events(path)? {
+            let at = event?.at;
+            span = Some(span.map_or((at, at), |(from, to)| (from.min(at), to.max(at))));
+        }
+        let span = span.ok_or_else(|| RecordingError::Empty(path.display().to_string()))?;
+        let replay = Arc::new(Self {
+            board: Arc::default(),
+            path: path.to_owned(),
+            span,
+            wheel: Mutex::new(Wheel {
+                playing: true,
+                speed: 1.0,
+                at: span.0,
+                since: Instant::now(),
+                jump: None,
+                stop: false,
+            }),
+            turned: Condvar::new(),
+        });
+        let player = replay.clone();
+        std::thread::Builder::new()
+            .name("replay".to_owned())
+            .spawn(move || player.play())
+            .map_err(|source| RecordingError::io(path, source))?;
+        Ok(replay)
+    }
+
+    /// Where its events arrive.
+    pub fn board(&self) -> &Arc<Board> {
+        &self.board
+    }
+
+    /// The moment of the recording that is shown [unix ns].
+    pub fn now(&self) -> i64 {
+        self.wheel().now(self.span.1)
+    }
+
+    /// How it is getting on.
+    pub fn view(&self) -> ReplayView {
+        let wheel = self.wheel();
+        let at = wheel.jump.unwrap_or_else(|| wheel.now(self.span.1));
+        ReplayView {
+            file: self.path.display().to_string(),
+            playing: wheel.playing && at < self.span.1,
+            speed: wheel.speed,
+            at_s: (at - self.span.0) as f64 * 1e-9,
+            duration_s: (self.span.1 - self.span.0) as f64 * 1e-9,
+        }
+    }
+
+    /// Plays or pauses, changes the speed [times real time], jumps [s since the begin]. Says what is wrong with a
+    /// wish that makes no sense, and then does nothing.
+    pub fn steer(&self, playing: Option<bool>, speed: Option<f64>, at_s: Option<f64>) -> Result<(), String> {
+        if let Some(speed) = speed.filter(|speed| !Self::SPEEDS.contains(speed)) {
+            let (from, to) = (Self::SPEEDS.start(), Self::SPEEDS.end());
+            return Err(format!("speed {speed} is not between {from} and {to}"));
+        }
+        if let Some(at_s) = at_s.filter(|at_s| !at_s.is_finite()) {
+            return Err(format!("{at_s} s is no moment"));
+        }
+        let mut wheel = self.wheel();
+        wheel.settle(self.span.1);
+        if let Some(at_s) = at_s {
+            let at = self.span.0.saturating_add((at_s * 1e9) as i64);
+            wheel.jump = Some(at.clamp(self.span.0, self.span.1));
+        }
+        wheel.playing = playing.unwrap_or(wheel.playing);
+        wheel.speed = speed.unwrap_or(wheel.speed);
+        drop(wheel);
+        self.turned.notify_all();
+        Ok(())
+    }
+
+    /// Ends the playing.
+    pub fn stop(&self) {
+        self.wheel().stop = true;
+        self.turned.notify_all();
+    }
+
+    fn wheel(&self) -> MutexGuard<'_, Wheel> {
+        self.wheel.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn play(&self) {
+        if let Err(error) = self.play_until_stopped() {
+            tracing::error!(%error, "the replay ends");
+        }
+    }
+
+    fn play_until_stopped(&self) -> Result<(), RecordingError> {
+        let mut events = Ahead::open(&self.path)?;
+        loop {
+            let (now, jump) = {
+                let mut wheel = self.wheel();
+                if wheel.stop {
+                    return Ok(());
+                }
+                (wheel.now(self.span.1), wheel.jump.take())
+            };
+            if let Some(to) = jump {
+                events = self.jump(to)?;
+                let mut wheel = self.wheel();
+                wheel.at = to;
+                wheel.since = Instant::now();
+                continue;
+            }
+            while let Some(event) = events.next_until(now)? {
+                self.board.take(event);
+            }
+            self.board.fleet().tick(now);
+            let wheel = self.wheel();
+            if wheel.jump.is_none() && !wheel.stop {
+                // Ten milliseconds of real time: less than from one snapshot to the next.
+                drop(self.turned.wait_timeout(wheel, Duration::from_millis(10)));
+            }
+        }
+    }
+
+    /// Plays from the begin up to `to` [unix ns] as fast as it goes, out of sight, and shows what comes out.
+    fn jump(&self, to: i64) -> Result<Ahead, RecordingError> {
+        const TICK: i64 = 100_000_000;
+        let mut events = Ahead::open(&self.path)?;
+        let mut fleet = Fleet::default();
+        let mut ticked = self.span.0;
+        while let Some(event) = events.next_until(to)? {
+            // Time passes as it did, so that a car that was out of sight was so then, too.
+            while ticked + TICK < event.at {
+                ticked += TICK;
+                fleet.tick(ticked);
+            }
+            fleet.apply(&event);
+        }
+        fleet.tick(to);
+        self.board.restart(fleet);
+        Ok(events)
+    }
+}
+
+/// The events of a recording, with a look at the next.
+struct Ahead {
+    events: Box<dyn Iterator<Item = Result<FleetEvent, RecordingError>> + Send>,
+    next: Option<FleetEvent>,
+}
+
+impl Ahead {
+    fn open(path: &Path) -> Result<Self, RecordingError> {
+        Ok(Self {
+            events: Box::new(read_events(path)?),
+            next: None,
+        })
+    }
+
+    /// The next event, if it arrived by `until` [unix ns].
+    fn next_until(&mut self, until: i64) -> Result<Option<FleetEvent>, RecordingError> {
+        if self.next.is_none() {
+            self.next = self.events.next().transpose()?;
+        }
+        Ok(self.next.take_if(|event| event.at <= until))
+    }
+}

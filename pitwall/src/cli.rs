@@ -82,14 +82,14 @@ pub(crate) enum Verb {
         #[arg(long, default_value = "2s", value_parser = duration)]
         wait: Duration,
     },
-    /// Follow one car: state, pose, rates, age, set in force.
+    /// Follow the cars on a whole screen, with the switch; as plain lines where stdout is no terminal.
     Watch {
-        /// The car.
-        car: CarName,
+        /// The car to begin with; without a terminal, the only one to be told of.
+        car: Option<CarName>,
         /// Stop after this time.
         #[arg(long = "for", value_name = "TIME", value_parser = duration)]
         time: Option<Duration>,
-        /// Views per second; 5 on a terminal, else 1.
+        /// Views per second; 10 on a terminal, else 1.
         #[arg(long, value_name = "HZ")]
         rate: Option<f64>,
     },

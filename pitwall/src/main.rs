@@ -12,8 +12,14 @@ use tracing_subscriber::EnvFilter;
 fn main() -> ExitCode {
     let cli = cli::Cli::parse();
     // zenoh speaks of every closed connection as an error; what concerns the operator we say ourselves.
-    let filter = EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| EnvFilter::new("warn,zenoh=off,zenoh_transport=off"));
+    // On the full screen, lines in between would be in the way.
+    let screen = matches!(cli.verb, Some(cli::Verb::Watch { .. })) && !cli.json && output::on_terminal();
+    let usual = if screen {
+        "off"
+    } else {
+        "warn,zenoh=off,zenoh_transport=off"
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(usual));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)

@@ -45,13 +45,6 @@ pub(crate) fn on_terminal() -> bool {
     std::io::stdout().is_terminal()
 }
 
-/// Writes over the screen.
-pub(crate) fn redraw(text: &str) {
-    // Home, then each line cleared to its end, then the rest of the screen.
-    let lines = text.replace('\n', "\x1b[K\n");
-    write(&format!("\x1b[H{lines}\x1b[K\n\x1b[J"));
-}
-
 /// One line a car.
 pub(crate) fn table(cars: &[CarView]) -> String {
     let mut text = format!(
@@ -166,6 +159,7 @@ pub(crate) fn card(car: &CarView) -> String {
     lines.join("\n")
 }
 
-fn number(value: Option<f64>, decimals: usize) -> String {
+/// A number, or a dash.
+pub(crate) fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or("-".to_owned(), |value| format!("{value:.decimals$}"))
 }

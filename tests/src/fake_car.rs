@@ -8,10 +8,11 @@ use std::time::Duration;
 
 use pitwall::unix_now;
 use protocol::{
-    Action, Answer, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Command,
-    Covariance, Event, EventKind, Health, Key, MapReply, Message, Metrics, Outcome, ParameterSet, Params,
-    ParamsAction, Pose, Pose2, PoseKind, RecordedOdometry, Reply, SetRef, Stamps, State, Topic, Twist2,
-    Value, decode, encode,
+    Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
+    Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Key, Latency, Load,
+    MapRaceline, MapReply, Message, Metrics, Outcome, ParameterSet, Params, ParamsAction, Pose, Pose2,
+    PoseKind, RecordedOdometry, RelocalizeAction, Reply, ScanView, SetRef, Stamps, State, Topic, TrackPoint,
+    Twist2, Value, decode, encode,
 };
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
@@ -24,6 +25,8 @@ pub struct Behaviour {
     pub mute: bool,
     /// It publishes bytes that are no message, as load.
     pub babbles: bool,
+    /// It starts so much later on its lap than the others, in updates of 25 ms.
+    pub behind: u64,
 }
 
 /// A running fake car. Dropping it ends it without a good-bye.
@@ -207,7 +210,9 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
     while running.load(Ordering::Relaxed) {
         ticks.tick().await;
         update += 1;
-        let pose = pose(update);
+        // Lap 1 has begun where it starts; those behind are on the lap before for a while.
+        let way = update + 80 - behaviour.behind % 80;
+        let pose = pose(update, way);
         topics.put(Topic::Pose, &pose, &state).await;
         topics.put(Topic::RecordedPose, &pose, &state).await;
         let odometry = RecordedOdometry {
@@ -218,14 +223,18 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
         if update % 4 == 1 {
             topics.put(Topic::Health, &health(update), &state).await;
             topics.put(Topic::Cloud, &cloud(&pose, update), &state).await;
+            topics.put(Topic::Scan, &scan_view(&pose), &state).await;
         }
         if update % 40 == 1 {
             let params = params(&state.lock().expect("no panic"));
             topics.put(Topic::Params, &params, &state).await;
+            if !behaviour.babbles {
+                topics.put(Topic::Load, &load(), &state).await;
+            }
         }
-        if update % 80 == 0 {
+        if way.is_multiple_of(80) && way > 80 {
             let kind = EventKind::Lap {
-                lap: (update / 80) as u32,
+                lap: (way / 80 - 1) as u32,
                 time: Some(2.0),
                 set: "hq".into(),
             };
@@ -244,17 +253,20 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
     }
 }
 
-/// A lap of 3 m radius in 2 s.
-fn pose(update: u64) -> Pose {
-    let angle = update as f64 / 80.0 * TAU;
+/// Radius of the line that it drives [m], in a ring of walls a metre to either side.
+const RADIUS: f64 = 3.0;
+
+/// A lap of 2 s, 80 steps of its way.
+fn pose(update: u64, way: u64) -> Pose {
+    let angle = (way % 80) as f64 / 80.0 * TAU;
     Pose {
         pose: Pose2 {
-            x: 3.0 * angle.cos(),
-            y: 3.0 * angle.sin(),
+            x: RADIUS * angle.cos(),
+            y: RADIUS * angle.sin(),
             heading: (angle + TAU / 4.0 + TAU / 2.0).rem_euclid(TAU) - TAU / 2.0,
         },
         twist: Twist2 {
-            linear_x: 3.0 * TAU / 2.0,
+            linear_x: RADIUS * TAU / 2.0,
             linear_y: 0.0,
             angular: TAU / 2.0,
         },
@@ -264,10 +276,94 @@ fn pose(update: u64) -> Pose {
             hh: 0.001,
             ..Covariance::default()
         },
-        track: None,
-        lap: (update / 80) as u32,
+        track: Some(TrackPoint {
+            s: RADIUS * angle,
+            d: 0.0,
+        }),
+        lap: (way / 80) as u32,
         update,
         kind: PoseKind::Updated,
+    }
+}
+
+/// The ring that it drives in.
+fn ring() -> MapReply {
+    const CELLS: u32 = 200;
+    const CELL: f64 = 0.05;
+    let half = f64::from(CELLS) * CELL / 2.0;
+    let cell = |i: u32| {
+        let at = |k: u32| (f64::from(k) + 0.5) * CELL - half;
+        let r = at(i % CELLS).hypot(at(i / CELLS));
+        match (r - RADIUS).abs() {
+            off if off < 0.95 => Cell::Free,
+            off if off < 1.05 => Cell::Occupied,
+            _ => Cell::Unknown,
+        }
+    };
+    let point = |i: u32| {
+        let angle = f64::from(i) / 120.0 * TAU;
+        [(RADIUS * angle.cos()) as f32, (RADIUS * angle.sin()) as f32]
+    };
+    MapReply {
+        name: "ring".into(),
+        width: CELLS,
+        height: CELLS,
+        resolution: CELL,
+        origin: Pose2 {
+            x: -half,
+            y: -half,
+            heading: 0.0,
+        },
+        runs: MapReply::pack((0..CELLS * CELLS).map(cell)),
+        raceline: Some(MapRaceline {
+            length: RADIUS * TAU,
+            points: (0..120).map(point).collect(),
+        }),
+    }
+}
+
+/// As many end points as a car sends, on both walls.
+fn scan_view(pose: &Pose) -> ScanView {
+    let centre = [pose.pose.x, pose.pose.y];
+    let point = |i: usize| {
+        let angle = i as f64 / 100.0 * TAU;
+        let r = if i.is_multiple_of(2) {
+            RADIUS - 1.0
+        } else {
+            RADIUS + 1.0
+        };
+        EndPoint::quantise([r * angle.cos(), r * angle.sin()], centre, EndPointKind::OnWall)
+    };
+    ScanView {
+        update: pose.update,
+        centre,
+        points: (0..100).map(point).collect(),
+    }
+}
+
+fn load() -> Load {
+    let latency = Latency {
+        p50: 200.0,
+        p99: 400.0,
+        max: 900.0,
+    };
+    Load {
+        cpu_process: 0.2,
+        cpu_cores: vec![0.3; 4],
+        memory_process: 90_000_000,
+        memory_used: 900_000_000,
+        memory_total: 4_000_000_000,
+        temperature: Some(61.0),
+        throttled: Some(false),
+        update_us: latency,
+        scan_age_us: latency,
+        publish_lag_us: latency,
+        scan_rate: 40.0,
+        odometry_rate: 50.0,
+        update_rate: 40.0,
+        scan_jitter: 0.001,
+        queue_depth: 0,
+        drops: Drops::default(),
     }
 }
 
@@ -330,23 +426,10 @@ async fn answer_questions(
         version: "0.1.0".into(),
         started: 1,
         source: "circle".into(),
-        map: "box".into(),
-        lap_length: None,
+        map: "ring".into(),
+        lap_length: Some(RADIUS * TAU),
         base_link_from_laser: Pose2::default(),
         host: "test".into(),
-    };
-    let map = MapReply {
-        name: "box".into(),
-        width: 2,
-        height: 2,
-        resolution: 5.0,
-        origin: Pose2 {
-            x: -5.0,
-            y: -5.0,
-            heading: 0.0,
-        },
-        runs: MapReply::pack([Cell::Free, Cell::Occupied, Cell::Free, Cell::Unknown]),
-        raceline: None,
     };
     reply_with(
         session,
@@ -357,7 +440,7 @@ async fn answer_questions(
     reply_with(
         session,
         key(Topic::Map),
-        encode(&map, Stamps::default()).expect("good"),
+        encode(&ring(), Stamps::default()).expect("good"),
     )
     .await;
     let clock = key(Topic::Clock);
@@ -381,9 +464,13 @@ async fn answer_questions(
         .background()
         .await
         .expect("a queryable");
-    let commands = key(Topic::CmdParams);
+    for topic in [Topic::CmdParams, Topic::CmdPose, Topic::CmdRelocalize] {
+        obey_on(session, key(topic), state.clone(), behaviour).await;
+    }
+}
+
+async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>>, behaviour: Behaviour) {
     let on = commands.clone();
-    let state = state.clone();
     let unanswered = Mutex::new(Vec::new());
     session
         .declare_queryable(&on)
@@ -445,6 +532,14 @@ fn obey(state: &mut CarState, command: &Command) -> Answer {
         (Action::Params(ParamsAction::Select { name, .. }), _) => Outcome::Refused {
             faults: vec![format!("no set {name}")],
         },
+        (Action::Relocalize(RelocalizeAction::Search), _) => Outcome::Done {
+            update: None,
+            reply: Reply::Candidates((1..=3).map(candidate).collect()),
+        },
+        (Action::Pose(_) | Action::Relocalize(_), _) => Outcome::Done {
+            update: Some(1),
+            reply: Reply::Nothing,
+        },
         _ => Outcome::Refused {
             faults: vec!["not on this car".into()],
         },
@@ -453,5 +548,15 @@ fn obey(state: &mut CarState, command: &Command) -> Answer {
         id: command.id,
         outcome,
         set: state.set.clone(),
+    }
+}
+
+/// Where it may be: three places of the ring that look alike.
+fn candidate(number: u32) -> Candidate {
+    let pose = pose(0, u64::from(number) * 26).pose;
+    Candidate {
+        number,
+        pose,
+        score: 0.9 - 0.1 * number as f32,
     }
 }

@@ -1,9 +1,13 @@
 //! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
 //! protocol, a bag of a drive in a drawn room, and waiting for conditions.
 
+#[cfg(feature = "browser")]
+mod browser;
 mod fake_car;
 mod synthetic_bag;
 
+#[cfg(feature = "browser")]
+pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
 pub use synthetic_bag::{room, true_pose, write_bag};
 

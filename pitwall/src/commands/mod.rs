@@ -38,7 +38,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     };
     match verb {
         Verb::Cars { wait } => cars::run(&link, wait, json).await,
-        Verb::Watch { car, time, rate } => watch::run(&link, &car, time, rate, json).await,
+        Verb::Watch { car, time, rate } => watch::run(&link, car, time, rate, json).await,
         Verb::Params { car, verb } => params::run(&link, &car, verb, json).await,
         Verb::Locate { car, how } => steer::locate(&link, &car, &how, json).await,
         Verb::Rates { car, rates } => steer::rates(&link, &car, &rates, json).await,

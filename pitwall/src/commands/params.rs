@@ -135,6 +135,22 @@ async fn shadow(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result
     Ok(ExitCode::SUCCESS)
 }
 
+/// The comparison on one line.
+pub(super) fn compare_short(shadow: &Shadow) -> String {
+    match (&shadow.set, &shadow.comparison) {
+        (Some(set), Some(c)) => format!(
+            "shadow  {set} fits better on {:.0} % of {} scans, {} on {:.0} %; poses {:.3} m apart",
+            c.shadow_better * 100.0,
+            c.scans,
+            c.in_force.name,
+            c.force_better * 100.0,
+            c.distance,
+        ),
+        (Some(set), None) => format!("shadow  {set}; nothing to compare yet"),
+        (None, _) => "shadow  none".to_owned(),
+    }
+}
+
 fn compare(car: &CarName, shadow: &Shadow) -> String {
     let Shadow {
         set, who, comparison, ..

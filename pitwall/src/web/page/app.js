@@ -148,6 +148,11 @@ function showReplay(replay) {
   $("replay-time").textContent = `${lasting(replay.at_s)} of ${lasting(replay.duration_s)}`;
   $("replay-file").textContent = replay.file.split("/").at(-1);
   if (!seeking) $("seek").value = replay.duration_s ? 1000 * replay.at_s / replay.duration_s : 0;
+  if (document.activeElement !== $("speed")) {
+    const speeds = [...$("speed").options].map((option) => option.value);
+    if (!speeds.includes(String(replay.speed))) $("speed").append(new Option(replay.speed));
+    $("speed").value = String(replay.speed);
+  }
   for (const id of ["place", "search", "mark"]) $(id).disabled = true;
 }
 const steer = (wish) => snapshot?.replay && post("/replay", wish);

@@ -1,0 +1,472 @@
+//! The full-screen view, for a terminal over ssh: all cars, one of them whole, what happened, and the switch.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::Duration;
+
+use pitwall::{CarView, Hub, LogEntry, Moment, unix_now};
+use protocol::{Action, CarName, Severity};
+use ratatui::crossterm::event::{self, Event, KeyEventKind};
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Modifier, Style, Stylize};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Clear, Paragraph, Row, Sparkline, Table, TableState};
+use ratatui::{DefaultTerminal, Frame};
+
+use super::keys::{Choice, Offer, Wish};
+use crate::commands::events::line;
+use crate::output;
+
+/// What is on the screen.
+#[derive(Default)]
+struct Shown {
+    cars: Vec<CarView>,
+    /// Health of the selected car over the last two minutes.
+    history: Vec<Moment>,
+    log: Vec<LogEntry>,
+    alarms: usize,
+    choice: Choice,
+    /// What became of the last command, and whether it was done; None while it is under way.
+    answer: Option<(Option<bool>, String)>,
+}
+
+/// Shows the cars until somebody presses q.
+pub(super) async fn run(
+    hub: Arc<Hub>,
+    car: Option<CarName>,
+    operator: String,
+    period: Duration,
+) -> anyhow::Result<()> {
+    // Reading keys blocks, and the terminal must be put back whatever happens: a thread of its own that owns it.
+    let runtime = tokio::runtime::Handle::current();
+    let leave = Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let stop = Guard(leave.clone());
+    let work = tokio::task::spawn_blocking(move || {
+        let mut terminal = ratatui::try_init()?;
+        let shown = loop_until(&mut terminal, &hub, car, &operator, period, &runtime, &leave);
+        ratatui::try_restore()?;
+        shown
+    });
+    let outcome = work.await?;
+    drop(stop);
+    outcome
+}
+
+/// Tells the thread to put the terminal back when the view is dropped.
+struct Guard(Arc<std::sync::atomic::AtomicBool>);
+
+impl Drop for Guard {
+    fn drop(&mut self) {
+        self.0.store(true, std::sync::atomic::Ordering::Relaxed);
+    }
+}
+
+fn loop_until(
+    terminal: &mut DefaultTerminal,
+    hub: &Arc<Hub>,
+    car: Option<CarName>,
+    operator: &str,
+    period: Duration,
+    runtime: &tokio::runtime::Handle,
+    leave: &std::sync::atomic::AtomicBool,
+) -> anyhow::Result<()> {
+    let mut shown = Shown::default();
+    let mut wanted = car;
+    let (answers, answered): (Sender<_>, Receiver<_>) = channel();
+    while !leave.load(std::sync::atomic::Ordering::Relaxed) {
+        shown.look(hub);
+        if let Some(at) = wanted
+            .as_ref()
+            .and_then(|name| shown.cars.iter().position(|c| c.car == *name))
+        {
+            shown.choice.car = at;
+            wanted = None;
+        }
+        shown.answer = answered.try_iter().last().or(shown.answer);
+        terminal.draw(|frame| shown.draw(frame))?;
+        if !event::poll(period)? {
+            continue;
+        }
+        let Event::Key(key) = event::read()? else {
+            continue;
+        };
+        if key.kind == KeyEventKind::Release {
+            continue;
+        }
+        match shown.press(key) {
+            Wish::Nothing => {}
+            Wish::Quit => return Ok(()),
+            Wish::Acknowledge => hub.fleet().acknowledge(unix_now(), operator),
+            Wish::Do(action) => {
+                if let Some(view) = shown.cars.get(shown.choice.car) {
+                    shown.answer = Some((None, format!("{}: asking the car", view.car)));
+                    let revision = view.set.as_ref().map(|set| set.revision);
+                    let order = give(
+                        hub.clone(),
+                        view.car.clone(),
+                        operator.to_owned(),
+                        revision,
+                        action,
+                    );
+                    let answers = answers.clone();
+                    runtime.spawn(async move { drop(answers.send(order.await)) });
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Gives a command, and says what became of it.
+async fn give(
+    hub: Arc<Hub>,
+    car: CarName,
+    operator: String,
+    revision: Option<u64>,
+    action: Action,
+) -> (Option<bool>, String) {
+    // A change of the set is meant for the one that is on the screen.
+    let expected = matches!(action, Action::Params(_)).then_some(revision).flatten();
+    match hub.link().command(&car, &operator, expected, action).await {
+        Ok(verdict) => (Some(verdict.exit_code() == 0), verdict.text(&car)),
+        Err(error) => (Some(false), format!("{car}: {error}")),
+    }
+}
+
+impl Shown {
+    const LOG: usize = 200;
+
+    /// Takes in how things are.
+    fn look(&mut self, hub: &Hub) {
+        let fleet = hub.fleet();
+        self.cars = fleet.view(unix_now());
+        self.alarms = fleet.log().alarms();
+        let from = fleet.log().last().saturating_sub(Self::LOG as u64);
+        self.log = fleet.log().since(from).cloned().collect();
+        let selected = self
+            .cars
+            .get(self.choice.car)
+            .and_then(|view| fleet.car(&view.car));
+        self.history = selected
+            .map(|car| car.history().copied().collect())
+            .unwrap_or_default();
+    }
+
+    fn press(&mut self, key: event::KeyEvent) -> Wish {
+        let cars: Vec<_> = self.cars.iter().map(|car| car.car.clone()).collect();
+        let set = self.cars.get(self.choice.car).and_then(|car| car.set.as_ref());
+        let sets = set.map(|set| set.available.clone()).unwrap_or_default();
+        let offer = Offer {
+            cars: &cars,
+            sets: &sets,
+        };
+        self.choice.press(key, offer)
+    }
+
+    fn draw(&self, frame: &mut Frame<'_>) {
+        let rows = self.cars.len().max(1) as u16 + 3;
+        let areas = Layout::vertical([
+            Constraint::Max(rows.min(frame.area().height / 2)),
+            Constraint::Min(11),
+            Constraint::Percentage(30),
+            Constraint::Length(1),
+        ])
+        .split(frame.area());
+        self.draw_cars(frame, areas[0]);
+        self.draw_car(frame, areas[1]);
+        self.draw_log(frame, areas[2]);
+        self.draw_foot(frame, areas[3]);
+        if self.choice.help {
+            popup(frame, "keys", &HELP.map(str::to_owned));
+        } else if let Some(at) = self.choice.sets {
+            self.draw_sets(frame, at);
+        }
+    }
+
+    fn draw_cars(&self, frame: &mut Frame<'_>, area: Rect) {
+        let head = [
+            "car", "state", "set", "pose/s", "age ms", "RTT ms", "missing", "lap s", "why",
+        ];
+        let rows = self.cars.iter().map(|car| {
+            let style = style_of(&car.state);
+            let set = car
+                .set
+                .as_ref()
+                .map_or("-".to_owned(), |set| format!("{} r{}", set.name, set.revision));
+            let state = format!("{} {}", shape_of(&car.state), car.state);
+            let missing: u64 = car.streams.values().map(|stream| stream.missing).sum();
+            let quiet = if car.blind {
+                Modifier::DIM
+            } else {
+                Modifier::empty()
+            };
+            Row::new([
+                Line::from(car.car.to_string()).bold(),
+                Line::styled(state, style.bold()),
+                Line::from(set),
+                Line::from(format!(
+                    "{:.0}",
+                    car.streams.get("pose").map_or(0.0, |s| s.rate_hz)
+                ))
+                .right_aligned(),
+                Line::from(output::number(car.pose.as_ref().map(|p| p.age_s * 1e3), 0)).right_aligned(),
+                Line::from(output::number(car.round_trip_s.map(|s| s * 1e3), 1)).right_aligned(),
+                Line::from(missing.to_string()).right_aligned(),
+                Line::from(output::number(car.last_lap_s, 2)).right_aligned(),
+                Line::from(car.causes.join("; ")),
+            ])
+            .style(Style::new().add_modifier(quiet))
+        });
+        let widths = [12, 15, 16, 6, 6, 6, 7, 7].map(Constraint::Length).into_iter();
+        let table = Table::new(rows, widths.chain([Constraint::Fill(1)]))
+            .header(Row::new(head).dim())
+            .row_highlight_style(Style::new().reversed())
+            .block(Block::bordered().title(" pit wall "));
+        let mut state = TableState::new().with_selected(self.choice.car);
+        if self.cars.is_empty() {
+            let text = "no car yet; start one with car-node run ... --connect tcp/THIS-LAPTOP:7447";
+            frame.render_widget(
+                Paragraph::new(text).block(Block::bordered().title(" pit wall ")),
+                area,
+            );
+        } else {
+            frame.render_stateful_widget(table, area, &mut state);
+        }
+    }
+
+    fn draw_car(&self, frame: &mut Frame<'_>, area: Rect) {
+        let Some(car) = self.cars.get(self.choice.car) else {
+            return;
+        };
+        let areas = Layout::vertical([Constraint::Min(8), Constraint::Length(3)]).split(area);
+        let block = Block::bordered()
+            .title(format!(" {} ", car.car))
+            .border_style(style_of(&car.state));
+        let mut lines: Vec<Line<'_>> = output::card(car)
+            .lines()
+            .skip(1)
+            .map(|l| Line::from(l.to_owned()))
+            .collect();
+        let since = if car.blind {
+            format!(" silent for {:.1} s", car.quiet_s)
+        } else {
+            car.state_for_s
+                .map_or_else(String::new, |s| format!(" for {s:.0} s"))
+        };
+        let state = format!("{} {}", shape_of(&car.state), car.state);
+        lines.insert(
+            0,
+            Line::from(vec![
+                Span::styled(state, style_of(&car.state).bold()),
+                Span::from(since),
+            ]),
+        );
+        if let Some(shadow) = &car.shadow {
+            lines.push(Line::from(crate::commands::params::compare_short(shadow)));
+        }
+        frame.render_widget(Paragraph::new(lines).block(block), areas[0]);
+        let width = areas[1].width.saturating_sub(2) as usize;
+        let percent: Vec<u64> = self
+            .history
+            .iter()
+            .rev()
+            .take(width)
+            .rev()
+            .map(|moment| (f64::from(moment.alignment) * 100.0).round() as u64)
+            .collect();
+        let title = " alignment, two points a second, 0 to 100 % ";
+        let spark = Sparkline::default()
+            .data(percent)
+            .max(100)
+            .style(style_of(&car.state))
+            .block(Block::bordered().title(title));
+        frame.render_widget(spark, areas[1]);
+    }
+
+    fn draw_log(&self, frame: &mut Frame<'_>, area: Rect) {
+        let room = area.height.saturating_sub(2) as usize;
+        let lines: Vec<_> = self
+            .log
+            .iter()
+            .rev()
+            .take(room)
+            .map(|entry| {
+                let style = match entry.severity {
+                    Severity::Info => Style::new(),
+                    Severity::Warning => Style::new().fg(Color::Yellow),
+                    Severity::Critical => Style::new().fg(Color::Red).bold(),
+                };
+                Line::styled(line(entry), style)
+            })
+            .collect();
+        let mut title = vec![Span::from(" events, UTC ")];
+        if self.alarms > 0 {
+            let alarms = format!(" {} not acknowledged (a) ", self.alarms);
+            title.push(Span::styled(
+                alarms,
+                Style::new().fg(Color::White).bg(Color::Red).bold(),
+            ));
+        }
+        frame.render_widget(
+            Paragraph::new(lines).block(Block::bordered().title(Line::from(title))),
+            area,
+        );
+    }
+
+    fn draw_foot(&self, frame: &mut Frame<'_>, area: Rect) {
+        let keys =
+            "↑↓ car   s sets   C confirm   R revert   G search the map   a acknowledge   ? keys   q quit";
+        let foot = match &self.answer {
+            None => Line::from(keys).dim(),
+            Some((done, text)) => {
+                let (mark, colour) = match done {
+                    None => ("…", Color::Blue),
+                    Some(true) => ("✓", Color::Green),
+                    Some(false) => ("✗", Color::Red),
+                };
+                Line::styled(
+                    format!("{mark} {}", text.replace('\n', " ")),
+                    Style::new().fg(colour),
+                )
+            }
+        };
+        frame.render_widget(Paragraph::new(foot), area);
+    }
+
+    fn draw_sets(&self, frame: &mut Frame<'_>, at: usize) {
+        let Some((car, set)) = self
+            .cars
+            .get(self.choice.car)
+            .and_then(|car| Some((car, car.set.as_ref()?)))
+        else {
+            return;
+        };
+        let mut lines: Vec<String> = set
+            .available
+            .iter()
+            .enumerate()
+            .map(|(i, name)| {
+                let cursor = if i == at { "▶" } else { " " };
+                let force = if *name == set.name { " (in force)" } else { "" };
+                format!("{cursor} {name}{force}")
+            })
+            .collect();
+        lines.push(String::new());
+        lines.push(
+            "Enter put in force   t for a minute unless confirmed   w in the shadow   Esc leave".into(),
+        );
+        popup(frame, &format!("sets of {}", car.car), &lines);
+    }
+}
+
+const HELP: [&str; 10] = [
+    "↑ ↓ or k j, 1 ... 9   select a car",
+    "s                     choose a set: put it in force, try it for a minute, run it in the shadow",
+    "C                     confirm the set in force: no falling back",
+    "R                     revert to the set before",
+    "W                     end the shadow",
+    "G                     let the car search the whole map",
+    "a                     acknowledge alarms",
+    "q, Esc, Ctrl-C        quit",
+    "",
+    "any key closes this",
+];
+
+/// A box in the middle of the screen.
+fn popup(frame: &mut Frame<'_>, title: &str, lines: &[String]) {
+    let width = lines.iter().map(|l| l.chars().count()).max().unwrap_or(0) as u16 + 4;
+    let area = frame.area();
+    let size = (width.min(area.width), (lines.len() as u16 + 2).min(area.height));
+    let place = Rect::new(
+        (area.width - size.0) / 2,
+        (area.height - size.1) / 2,
+        size.0,
+        size.1,
+    );
+    frame.render_widget(Clear, place);
+    let block = Block::bordered().title(format!(" {title} ")).bold();
+    frame.render_widget(Paragraph::new(lines.join("\n")).block(block), place);
+}
+
+/// Word and shape carry what the colour does.
+fn shape_of(state: &str) -> &'static str {
+    match state {
+        "LOCALIZED" => "●",
+        "DEGRADED" => "▲",
+        "LOST" => "✖",
+        "STALE" => "■",
+        "RELOCALIZING" => "↻",
+        "CONVERGING" => "◐",
+        "BLIND" => "□",
+        _ => "○",
+    }
+}
+
+fn style_of(state: &str) -> Style {
+    let colour = match state {
+        "LOCALIZED" => Color::Green,
+        "DEGRADED" => Color::Yellow,
+        "LOST" | "STALE" => Color::Red,
+        "RELOCALIZING" | "CONVERGING" => Color::Blue,
+        _ => Color::DarkGray,
+    };
+    Style::new().fg(colour)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pitwall::{Fleet, FleetEvent, Happening};
+    use ratatui::Terminal;
+    use ratatui::backend::TestBackend;
+
+    fn picture(shown: &Shown, width: u16, height: u16) -> String {
+        let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
+        terminal.draw(|frame| shown.draw(frame)).expect("drawn");
+        terminal.backend().to_string()
+    }
+
+    fn shown() -> Shown {
+        let mut fleet = Fleet::default();
+        for name in ["car-1", "car-2"] {
+            fleet.apply(&FleetEvent {
+                at: 0,
+                car: name.parse().expect("a name"),
+                happening: Happening::Appeared,
+            });
+        }
+        fleet.tick(7_000_000_000);
+        Shown {
+            cars: fleet.view(7_000_000_000),
+            log: fleet.log().since(0).cloned().collect(),
+            alarms: fleet.log().alarms(),
+            ..Shown::default()
+        }
+    }
+
+    #[test]
+    fn silence_is_told_in_words_with_its_length() {
+        let text = picture(&shown(), 120, 30);
+        for expected in [
+            "□ BLIND",
+            "silent for 7.0 s",
+            "car-2 BLIND: nothing comes",
+            "2 not acknowledged",
+        ] {
+            assert!(text.contains(expected), "{expected:?} is not in\n{text}");
+        }
+    }
+
+    #[test]
+    fn any_size_can_be_drawn() {
+        let mut shown = shown();
+        for (sets, help) in [(None, false), (Some(3), false), (None, true)] {
+            shown.choice.sets = sets;
+            shown.choice.help = help;
+            for (width, height) in [(1, 1), (10, 3), (40, 12), (80, 24), (250, 80)] {
+                picture(&shown, width, height);
+            }
+        }
+        picture(&Shown::default(), 80, 24);
+    }
+}

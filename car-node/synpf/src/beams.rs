@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::odometry_track::OdometryTrack;
 use crate::parameters::Check;
+use crate::slip::Slip;
 use crate::{Dropped, Scan};
 
 /// How the beams to weigh are chosen.
@@ -89,12 +90,13 @@ const STRETCHES: usize = 8;
 const NO_POINT: u32 = u32::MAX;
 
 impl ReadyScan {
-    /// Makes a scan ready. Readings that are not finite, below `range_min` or from `range_max` (or
+    /// Makes a scan ready, its beams brought to the stamp by odometry less what `slip` says it errs by. Readings that are not finite, below `range_min` or from `range_max` (or
     /// `max_range`) on are no returns. A scan may differ in geometry from the one before.
     pub(crate) fn load(
         &mut self,
         scan: &Scan,
         track: &OdometryTrack,
+        slip: Slip,
         base_link_from_laser: Pose,
         max_range: f64,
         parameters: &BeamParameters,
@@ -131,10 +133,11 @@ impl ReadyScan {
             // The laser's pose at the end of the stretch, seen from base_link at the scan's stamp.
             let finish = match at_stamp {
                 Some(from_odom) if deskew => {
-                    let time = scan.stamp.plus(scan.time_increment * end as f64);
-                    track
-                        .at(time, sweep + 0.1)
-                        .map_or(start, |(pose, _)| from_odom * pose * base_link_from_laser)
+                    let seconds = scan.time_increment * end as f64;
+                    let moved = track.at(scan.stamp.plus(seconds), sweep + 0.1);
+                    moved.map_or(start, |(pose, _)| {
+                        slip.corrected(from_odom * pose, seconds) * base_link_from_laser
+                    })
                 }
                 _ => base_link_from_laser,
             };
@@ -333,7 +336,14 @@ mod tests {
     fn load(scan: &Scan, track: &OdometryTrack, parameters: &BeamParameters) -> Result<ReadyScan, Dropped> {
         let mut ready = ReadyScan::default();
         ready
-            .load(scan, track, Pose::new(0.27, 0.0, 0.0), 25.0, parameters)
+            .load(
+                scan,
+                track,
+                Slip::default(),
+                Pose::new(0.27, 0.0, 0.0),
+                25.0,
+                parameters,
+            )
             .map(|()| ready)
     }
 

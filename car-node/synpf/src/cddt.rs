@@ -8,6 +8,7 @@
 
 use maps::DistanceField;
 use rayon::prelude::*;
+use wide::f32x4;
 
 use crate::range_table::DIRECTIONS;
 
@@ -42,7 +43,7 @@ impl Cddt {
 
     /// Memory that it takes [bytes].
     pub(crate) fn bytes(&self) -> usize {
-        let bytes = |lanes: &Lanes| size_of_val(&*lanes.starts) + size_of_val(&*lanes.crossings);
+        let bytes = |lanes: &Lanes| size_of_val(&*lanes.starts) + size_of_val(&*lanes.fours);
         self.directions.iter().map(bytes).sum()
     }
 }
@@ -54,18 +55,28 @@ pub(crate) struct Lanes {
     along: [f32; 2],
     /// Offset across the lanes of lane 0 [lanes].
     first: f32,
-    /// Where each lane begins in `crossings`; one more at the end.
+    /// Where each lane begins in `fours`; one more at the end.
     starts: Vec<u32>,
-    /// Crossings of the lanes' middles with faces, sorted along each lane.
-    crossings: Vec<Crossing>,
+    /// Crossings of the lanes' middles with faces, sorted along each lane, with one at minus infinity before them
+    /// and plus infinity up to the end of the last four.
+    fours: Vec<Four>,
 }
 
+/// A crossing of a lane's middle with a face.
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
+    lane: u32,
     /// Place along the lane's middle [cells].
     at: f32,
     /// How the place moves across the lane [cells per lane].
     slope: f32,
+}
+
+/// Four crossings, compared at once.
+#[derive(Debug, Clone, Copy)]
+struct Four {
+    at: [f32; 4],
+    slope: [f32; 4],
 }
 
 impl Lanes {
@@ -80,60 +91,63 @@ impl Lanes {
             high = high.max(offset);
         }
         if faces.is_empty() {
-            return Self {
-                along,
-                first: 0.0,
-                starts: vec![0],
-                crossings: Vec::new(),
-            };
+            (low, high) = (0.0, 0.0);
         }
         let first = low.floor() - 1.0;
         let count = (high - first) as usize + 2;
-        // The lanes whose middles a face crosses, and where.
-        let crossed = |face: &[[f32; 2]; 2]| {
+        let mut crossings = Vec::with_capacity(2 * faces.len());
+        for face in faces {
             let (a, b) = (across(&face[0]) - first, across(&face[1]) - first);
-            let lanes = (a.min(b) - 0.5).ceil() as u32..(a.max(b) - 0.5).ceil() as u32;
+            let (from, to) = (place(&face[0]), place(&face[1]));
             let width = b - a;
             // A face along the lanes crosses the middle of none.
             let slope = if width.abs() < 1e-6 {
                 0.0
             } else {
-                (place(&face[1]) - place(&face[0])) / width
+                (to - from) / width
             };
-            (lanes, place(&face[0]) - slope * a, slope)
-        };
-        let mut starts = vec![0u32; count + 1];
-        for face in faces {
-            for lane in crossed(face).0 {
-                starts[lane as usize + 1] += 1;
+            for lane in upward(a.min(b) - 0.5)..upward(a.max(b) - 0.5) {
+                crossings.push(Crossing {
+                    lane,
+                    at: from + slope * (lane as f32 + 0.5 - a),
+                    // A face along the lane must not reach beyond its own half cell.
+                    slope: slope.clamp(-4.0, 4.0),
+                });
             }
+        }
+        // Slots for every lane, with the two infinities.
+        let mut starts = vec![0u32; count + 1];
+        for crossing in &crossings {
+            starts[crossing.lane as usize + 1] += 1;
         }
         for lane in 0..count {
-            starts[lane + 1] += starts[lane];
+            starts[lane + 1] = starts[lane] + (starts[lane + 1] + 2).div_ceil(4);
         }
-        let mut crossings = vec![Crossing { at: 0.0, slope: 0.0 }; starts[count] as usize];
-        let mut next = starts.clone();
-        for face in faces {
-            let (lanes, origin, slope) = crossed(face);
-            for lane in lanes {
-                let slot = &mut next[lane as usize];
-                // A face along the lane must not reach beyond its own half cell.
-                let at = origin + slope * (lane as f32 + 0.5);
-                crossings[*slot as usize] = Crossing {
-                    at,
-                    slope: slope.clamp(-4.0, 4.0),
-                };
-                *slot += 1;
-            }
+        let slots = 4 * starts[count] as usize;
+        let mut sorted = vec![(f32::INFINITY, 0.0f32); slots];
+        let mut next: Vec<u32> = starts[..count].iter().map(|start| 4 * start).collect();
+        for slot in &mut next {
+            sorted[*slot as usize].0 = f32::NEG_INFINITY;
+            *slot += 1;
         }
-        for pair in starts.windows(2) {
-            crossings[pair[0] as usize..pair[1] as usize].sort_unstable_by(|a, b| a.at.total_cmp(&b.at));
+        for crossing in &crossings {
+            let slot = &mut next[crossing.lane as usize];
+            sorted[*slot as usize] = (crossing.at, crossing.slope);
+            *slot += 1;
         }
+        for (start, end) in starts.iter().zip(&next) {
+            // A handful, most of them in order.
+            sorted[4 * *start as usize..*end as usize].sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+        }
+        let four = |four: &[(f32, f32)]| Four {
+            at: std::array::from_fn(|i| four[i].0),
+            slope: std::array::from_fn(|i| four[i].1),
+        };
         Self {
             along,
             first,
             starts,
-            crossings,
+            fours: sorted.chunks_exact(4).map(four).collect(),
         }
     }
 
@@ -145,22 +159,28 @@ impl Lanes {
         if !(lane >= 0.0 && index + 1 < self.starts.len()) {
             return [f32::INFINITY; 2];
         }
-        let crossings = &self.crossings[self.starts[index] as usize..self.starts[index + 1] as usize];
+        let fours = &self.fours[self.starts[index] as usize..self.starts[index + 1] as usize];
         let off = lane - index as f32 - 0.5;
         let at = from[0] * self.along[0] + from[1] * self.along[1];
-        let here = |crossing: &Crossing| crossing.at + crossing.slope * off;
-        // A lane meets a handful of walls: counting those behind beats a search with its branches.
-        let mut behind = 0;
-        for crossing in crossings {
-            behind += usize::from(here(crossing) <= at);
+        // A lane meets a handful of walls, four of them compared at once.
+        let (offs, ats) = (f32x4::splat(off), f32x4::splat(at));
+        let mut ahead = 0;
+        for four in fours {
+            let behind = (f32x4::from(four.at) + f32x4::from(four.slope) * offs).simd_le(ats);
+            let count = behind.to_bitmask().trailing_ones() as usize;
+            ahead += count;
+            if count < 4 {
+                break;
+            }
         }
-        [
-            crossings
-                .get(behind)
-                .map_or(f32::INFINITY, |crossing| here(crossing) - at),
-            behind
-                .checked_sub(1)
-                .map_or(f32::INFINITY, |last| at - here(&crossings[last])),
-        ]
+        let here = |i: usize| fours[i / 4].at[i % 4] + fours[i / 4].slope[i % 4] * off;
+        // The infinities bound the count from both sides.
+        [here(ahead) - at, at - here(ahead - 1)]
     }
+}
+
+/// The least whole number not below a number that is not negative; quicker than `ceil` without SSE 4.1.
+fn upward(v: f32) -> u32 {
+    let whole = v as u32;
+    whole + u32::from((whole as f32) < v)
 }

@@ -339,6 +339,7 @@ impl Localizer {
         self.scan.load(
             scan,
             &self.track,
+            self.slip,
             self.base_link_from_laser,
             max_range,
             &self.parameters.beams,

@@ -152,6 +152,8 @@ pub(crate) struct Particles {
     pub(crate) rng: SmallRng,
     pool: NormalPool,
     spare: [Vec<f32>; 3],
+    /// For resampling: which particle each new one is a copy of.
+    copies: Vec<u32>,
     bins: Bins,
 }
 
@@ -182,6 +184,7 @@ impl Particles {
             rng,
             pool,
             spare: [array(), array(), array()],
+            copies: Vec::with_capacity(capacity + 4),
             bins: Bins::new(),
         }
     }
@@ -253,7 +256,8 @@ impl Particles {
                     (x + a * cos - b * sin, y + a * sin + b * cos, heading + c)
                 };
                 let turn = f32x8::splat(std::f32::consts::TAU);
-                let wrapped = turned - turn * (turned * f32x8::splat(1.0 / std::f32::consts::TAU)).round();
+                let turns = (turned * f32x8::splat(1.0 / std::f32::consts::TAU)).fast_round_int();
+                let wrapped = turned - turn * f32x8::from_i32x8(turns);
                 let (sin, cos) = wrapped.sin_cos();
                 store(x, &mut self.x[i..], lanes);
                 store(y, &mut self.y[i..], lanes);
@@ -268,7 +272,7 @@ impl Particles {
     /// Weights from log-weights, with sum 1. If every weight is zero, or not a number, all become equal and the
     /// answer is false.
     pub(crate) fn normalize(&mut self) -> bool {
-        let greatest = self.log_weight.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let greatest = greatest(&self.log_weight);
         if !greatest.is_finite() {
             self.even_weights();
             return false;
@@ -278,13 +282,14 @@ impl Particles {
         let count = self.len();
         for i in (0..count).step_by(8) {
             let lanes = 8.min(count - i);
-            let mut log = [f32::NEG_INFINITY; 8];
-            log[..lanes].copy_from_slice(&self.log_weight[i..i + lanes]);
             // Below e^-80 a weight is nothing; it also keeps infinities out.
-            let weight = (f32x8::from(log) - top).max(f32x8::splat(-80.0)).exp();
-            let mut kept = weight.to_array();
-            kept[lanes..].fill(0.0);
-            let weight = f32x8::from(kept);
+            let log = load(&self.log_weight[i..], lanes) - top;
+            let mut weight = log.max(f32x8::splat(-80.0)).exp();
+            if lanes < 8 {
+                let mut kept = weight.to_array();
+                kept[lanes..].fill(0.0);
+                weight = f32x8::from(kept);
+            }
             sum += weight;
             store(weight, &mut self.weight[i..], lanes);
         }
@@ -301,18 +306,16 @@ impl Particles {
         let count = self.len();
         for i in (0..count).step_by(8) {
             let lanes = 8.min(count - i);
-            let mut kept = [0.0; 8];
-            kept[..lanes].copy_from_slice(&self.weight[i..i + lanes]);
-            let w = f32x8::from(kept);
+            let w = load(&self.weight[i..], lanes);
             let (x, y) = (
                 load(&self.x[i..], lanes) - f32x8::splat(x0),
                 load(&self.y[i..], lanes) - f32x8::splat(y0),
             );
             let (c, s) = (load(&self.cos[i..], lanes), load(&self.sin[i..], lanes));
             let (wx, wy) = (w * x, w * y);
-            for (sum, term) in
-                sums.iter_mut()
-                    .zip([w, wx, wy, w * c, w * s, wx * x, wy * y, wx * y, w * w, w * s * s])
+            for (sum, term) in sums
+                .iter_mut()
+                .zip([w, wx, wy, w * c, w * s, wx * x, wy * y, wx * y, w * w])
             {
                 *sum += term;
             }
@@ -376,23 +379,36 @@ impl Particles {
 
     /// Systematic resampling (Probabilistic Robotics, table 4.4) to `count` particles of equal weight.
     pub(crate) fn resample(&mut self, count: usize) {
-        let old = self.len();
-        for array in &mut self.spare {
-            array.resize(count, 0.0);
-        }
-        let step = 1.0 / count as f64;
-        let mut target = self.rng.random::<f64>() * step;
-        let (mut i, mut sum) = (0, f64::from(self.weight[0]));
-        let [x, y, heading] = &mut self.spare;
-        for k in 0..count {
-            while sum < target && i + 1 < old {
-                i += 1;
-                sum += f64::from(self.weight[i]);
+        // Particle i gets the copies up to where its share of the sum ends. Which particle each copy is of is written
+        // four at a time and then overwritten, because most particles get fewer, and a loop would be guessed wrongly.
+        const AT_ONCE: usize = 4;
+        self.copies.clear();
+        self.copies.resize(count + AT_ONCE, 0);
+        let offset = self.rng.random::<f64>();
+        let (mut sum, mut begin) = (0.0, 0);
+        for (i, &weight) in self.weight.iter().enumerate() {
+            sum += f64::from(weight);
+            let end = ((sum * count as f64 - offset + 1.0) as usize).min(count);
+            let some: &mut [u32; AT_ONCE] = (&mut self.copies[begin..begin + AT_ONCE])
+                .try_into()
+                .expect("as many as asked for");
+            *some = [i as u32; AT_ONCE];
+            if end > begin + AT_ONCE {
+                self.copies[begin + AT_ONCE..end].fill(i as u32);
             }
-            x[k] = self.x[i];
-            y[k] = self.y[i];
-            heading[k] = self.heading[i];
-            target += step;
+            begin = end.max(begin);
+        }
+        // What rounding leaves over is the last one's.
+        let last = self.len() as u32 - 1;
+        self.copies[begin..].fill(last);
+        let [x, y, heading] = &mut self.spare;
+        for (to, from) in [
+            (&mut *x, &self.x),
+            (&mut *y, &self.y),
+            (&mut *heading, &self.heading),
+        ] {
+            to.clear();
+            to.extend(self.copies[..count].iter().map(|&i| from[i as usize]));
         }
         std::mem::swap(&mut self.x, x);
         std::mem::swap(&mut self.y, y);
@@ -424,8 +440,24 @@ impl Particles {
     }
 }
 
+/// The greatest of the values that are numbers; minus infinity of none.
+fn greatest(values: &[f32]) -> f32 {
+    let (eights, rest) = values.as_chunks::<8>();
+    let mut most = [f32::NEG_INFINITY; 8];
+    for eight in eights {
+        for (most, &value) in most.iter_mut().zip(eight) {
+            // Not `f32::max`: this compiles to one instruction for four, and leaves NaN out as well.
+            *most = if value > *most { value } else { *most };
+        }
+    }
+    most.into_iter()
+        .chain(rest.iter().copied())
+        .fold(f32::NEG_INFINITY, f32::max)
+}
+
+/// Eight lanes of which the first `lanes` are the values' and the rest 0.
 #[inline]
-fn load(values: &[f32], lanes: usize) -> f32x8 {
+pub(crate) fn load(values: &[f32], lanes: usize) -> f32x8 {
     if lanes == 8 {
         f32x8::from(<[f32; 8]>::try_from(&values[..8]).expect("eight lanes"))
     } else {
@@ -437,7 +469,12 @@ fn load(values: &[f32], lanes: usize) -> f32x8 {
 
 #[inline]
 fn store(value: f32x8, to: &mut [f32], lanes: usize) {
-    to[..lanes].copy_from_slice(&value.to_array()[..lanes]);
+    // A length that is known is a store; one that is not, a call.
+    if lanes == 8 {
+        to[..8].copy_from_slice(value.as_array());
+    } else {
+        to[..lanes].copy_from_slice(&value.as_array()[..lanes]);
+    }
 }
 
 /// A hash table of the bins that particles fall into, emptied by counting up.

@@ -2,6 +2,7 @@
 
 use maps::{DistanceField, OccupancyGrid};
 use rayon::prelude::*;
+use wide::{f32x8, i32x8};
 
 use crate::cddt::{HALF_TURN, Lanes};
 
@@ -26,7 +27,8 @@ pub(crate) struct TableParameters {
 /// A range table for one region.
 #[derive(Debug)]
 pub(crate) struct RangeTable {
-    /// For each cell of the grid its row in `ranges`; [`NO_ROW`] for cells outside the region.
+    /// For each cell of the grid its row in `ranges`; [`NO_ROW`] for cells outside the region, and once more at the
+    /// end for what is outside the grid.
     row_of: Vec<u32>,
     /// Rows of [`DIRECTIONS`] ranges, the first along x, in units of [`UNIT`].
     ranges: Vec<u16>,
@@ -43,7 +45,7 @@ impl RangeTable {
         cells: &[u32],
         parameters: TableParameters,
     ) -> Self {
-        let mut row_of = vec![NO_ROW; grid.cells.len()];
+        let mut row_of = vec![NO_ROW; grid.cells.len() + 1];
         for (row, &cell) in cells.iter().enumerate() {
             row_of[cell as usize] = row as u32;
         }
@@ -51,29 +53,35 @@ impl RangeTable {
         let bias = if parameters.long_ranges { 0.5 } else { 0.0 };
         let stored = |range: f32| ((range + bias) * scale + 0.5) as u16;
         let faces = field.contour();
+        // On a wall's face, where grey calls a cell free, there is no laser: its ranges stay 0.
+        let centres: Vec<(usize, [f32; 2])> = cells
+            .iter()
+            .enumerate()
+            .filter(|(_, cell)| field.values()[**cell as usize] > 0.0)
+            .map(|(row, &cell)| {
+                let (column, line) = (cell as usize % grid.width, cell as usize / grid.width);
+                (row, [column as f32 + 0.5, line as f32 + 0.5])
+            })
+            .collect();
         // Each task fills a stretch of directions, and the same half a turn on, in buffers of its own.
         let stretches: Vec<Vec<[[u16; STRETCH]; 2]>> = (0..HALF_TURN / STRETCH)
             .into_par_iter()
             .map(|stretch| {
                 let mut part = vec![[[0; STRETCH]; 2]; cells.len()];
-                for k in 0..STRETCH {
+                let fill = |part: &mut [[[u16; STRETCH]; 2]], k: usize| {
                     let direction = (stretch * STRETCH + k) as f64 / DIRECTIONS as f64;
                     let steps = f64::from(parameters.directions);
                     let lanes = Lanes::new(
                         &faces,
                         (direction * steps).round() / steps * std::f64::consts::TAU,
                     );
-                    for (entry, &cell) in part.iter_mut().zip(cells) {
-                        let cell = cell as usize;
-                        // On a wall's face, where grey calls a cell free, there is no laser.
-                        if field.values()[cell] > 0.0 {
-                            let centre = [(cell % grid.width) as f32 + 0.5, (cell / grid.width) as f32 + 0.5];
-                            let [ahead, behind] = lanes.ranges(centre);
-                            entry[0][k] = stored(ahead);
-                            entry[1][k] = stored(behind);
-                        }
+                    for &(row, centre) in &centres {
+                        let [ahead, behind] = lanes.ranges(centre);
+                        part[row][0][k] = stored(ahead);
+                        part[row][1][k] = stored(behind);
                     }
-                }
+                };
+                (0..STRETCH).for_each(|k| fill(&mut part, k));
                 part
             })
             .collect();
@@ -102,17 +110,32 @@ impl RangeTable {
         self.ranges.len() * size_of::<u16>() + self.row_of.len() * size_of::<u32>()
     }
 
-    /// The ranges from a point in grid coordinates [cells], in all directions; None outside the region.
+    /// The rows for eight points in grid coordinates [cells]; see [`RangeTable::row`].
     #[inline]
-    pub(crate) fn row(&self, u: f32, v: f32) -> Option<&[u16; DIRECTIONS]> {
-        if !(u >= 0.0 && v >= 0.0) {
-            return None;
-        }
-        let (column, row) = (u as usize, v as usize);
-        if column >= self.width || row >= self.height {
-            return None;
-        }
-        let start = self.row_of[row * self.width + column] as usize * DIRECTIONS;
+    pub(crate) fn rows_at(&self, u: f32x8, v: f32x8) -> [u32; 8] {
+        let zero = f32x8::ZERO;
+        // False for NaN.
+        let inside = u.simd_ge(zero)
+            & v.simd_ge(zero)
+            & u.simd_lt(f32x8::splat(self.width as f32))
+            & v.simd_lt(f32x8::splat(self.height as f32));
+        let cell = v.fast_trunc_int() * i32x8::splat(self.width as i32) + u.fast_trunc_int();
+        let (inside, cell) = (inside.to_bitmask(), cell.to_array());
+        let outside = self.row_of.len() - 1;
+        std::array::from_fn(|k| {
+            let cell = if inside >> k & 1 == 1 {
+                cell[k] as usize
+            } else {
+                outside
+            };
+            self.row_of[cell]
+        })
+    }
+
+    /// The ranges in all directions of a row; None for one outside the region.
+    #[inline]
+    pub(crate) fn row(&self, row: u32) -> Option<&[u16; DIRECTIONS]> {
+        let start = row as usize * DIRECTIONS;
         self.ranges.get(start..start + DIRECTIONS)?.try_into().ok()
     }
 }

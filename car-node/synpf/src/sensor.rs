@@ -116,11 +116,17 @@ impl SensorParameters {
 pub(crate) const STEP_SHIFT: u32 = 3;
 const STEP: f64 = UNIT as f64 * (1 << STEP_SHIFT) as f64;
 
+/// Rows come in lengths that the kernel knows when it is compiled, so that no look-up has to be checked: up to
+/// 20 m, 41 m, and what 16 bits hold.
+pub(crate) const ROW_LENGTHS: [usize; 3] = [1024, 2048, 1 << (16 - STEP_SHIFT)];
+
 /// The beam model as a table of log-likelihoods, `[measured][predicted]` in steps of 2 cm.
 #[derive(Debug, Clone)]
 pub(crate) struct BeamModel {
     /// Steps up to the greatest range, which is the last.
     steps: usize,
+    /// Length of a row: one of [`ROW_LENGTHS`], the rest filled with the last step's value.
+    length: usize,
     rows: Vec<f32>,
     /// The log-likelihood per beam of a particle that is nowhere: a random range, and unlikely.
     pub(crate) off_track: f32,
@@ -171,34 +177,51 @@ impl BeamModel {
             })
             .collect();
         let uniform = z_rand / steps as f64;
-        let mut rows = vec![0.0f32; steps * steps];
-        for (measured, row) in rows.chunks_exact_mut(steps).enumerate() {
+        let length = ROW_LENGTHS.into_iter().find(|length| steps <= *length);
+        let length = length.unwrap_or(ROW_LENGTHS[2]);
+        let mut rows = vec![0.0f32; steps * length];
+        for (measured, row) in rows.chunks_exact_mut(length).enumerate() {
             let none = if measured + 1 == steps { z_max } else { 0.0 };
-            for (predicted, value) in row.iter_mut().enumerate() {
+            for (predicted, value) in row[..steps].iter_mut().enumerate() {
                 let mut p = uniform + none + hit_scale[predicted] * gauss[measured.abs_diff(predicted)];
                 if measured <= predicted {
                     p += short_scale[predicted] * short[measured];
                 }
                 *value = (p as f32).ln() * squash as f32;
             }
+            let last = row[steps - 1];
+            row[steps..].fill(last);
         }
         let off_track = (uniform * 0.1).ln() * squash;
         Self {
             steps,
+            length,
             rows,
             off_track: off_track as f32,
         }
     }
 
+    /// The row for a measured range [m]; infinite for no return. `N` is [`BeamModel::row_length`].
+    pub(crate) fn fixed_row<const N: usize>(&self, measured: f32) -> &[f32; N] {
+        self.row(measured)
+            .try_into()
+            .expect("the length that was asked for")
+    }
+
     /// The row for a measured range [m]; infinite for no return.
     pub(crate) fn row(&self, measured: f32) -> &[f32] {
         let step = ((f64::from(measured) / STEP).round() as usize).min(self.steps - 1);
-        &self.rows[step * self.steps..(step + 1) * self.steps]
+        &self.rows[step * self.length..(step + 1) * self.length]
     }
 
-    /// The last step, which stands for everything out of range.
-    pub(crate) fn last(&self) -> u32 {
-        self.steps as u32 - 1
+    /// The length of a row.
+    pub(crate) fn row_length(&self) -> usize {
+        self.length
+    }
+
+    /// The greatest range that differs from no return [m].
+    pub(crate) fn reach(&self) -> f32 {
+        ((self.steps - 1) as f64 * STEP) as f32
     }
 
     /// The step of a predicted range in cells of `resolution` [m].
@@ -266,7 +289,7 @@ mod tests {
         let model = model();
         for predicted in [0, 5, 100, 500, model.steps - 1] {
             let sum: f32 = (0..model.steps)
-                .map(|measured| model.rows[measured * model.steps + predicted].exp())
+                .map(|measured| model.rows[measured * model.length + predicted].exp())
                 .sum();
             assert!((sum - 1.0).abs() < 0.01, "{predicted}: {sum}");
         }

@@ -29,6 +29,19 @@ pub(crate) struct Slip {
     pub(crate) yaw_rate: f64,
 }
 
+impl Slip {
+    /// What a motion by odometry over `seconds` was in truth, if the slip goes on as it was.
+    pub(crate) fn corrected(self, motion: Pose, seconds: f64) -> Pose {
+        // More than this is a pose that has jumped.
+        let (ratio, yaw_rate) = (self.ratio.clamp(-0.3, 0.3), self.yaw_rate.clamp(-2.0, 2.0));
+        Pose::new(
+            motion.x * (1.0 - ratio),
+            motion.y * (1.0 - ratio),
+            motion.heading - yaw_rate * seconds,
+        )
+    }
+}
+
 /// Length of the window [s].
 const WINDOW: f64 = 0.3;
 

@@ -3,7 +3,7 @@
 
 use std::path::PathBuf;
 
-use car_node::evaluate::Start;
+use car_node::evaluate::{Fault, Start};
 use car_node::node::Begin;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
@@ -148,6 +148,11 @@ pub(crate) struct Evaluate {
     /// Seed of the filter's random numbers; may be repeated, or a list: 0,1,2.
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0")]
     pub(crate) seed: Vec<u64>,
+    /// Do something to the log first, and tell what the health state said to it: kidnap@20+4 carries the car on by
+    /// 4 s of driving, 20 s after the first scan; so do no-scans, no-odometry, blocked (an opponent ahead) and
+    /// black-tubes; may be repeated.
+    #[arg(long, value_name = "KIND@S+S")]
+    pub(crate) fault: Vec<Fault>,
     /// Which topics of the bags to take.
     #[command(flatten)]
     pub(crate) topics: TopicArguments,

@@ -5,15 +5,20 @@
 //!            first pose            0.5 s good and 1 m driven
 //!   INIT ------------> CONVERGING --------------------------> LOCALIZED <----> DEGRADED
 //!                        ^    |                                   any metric bad for 3 scans; 0.5 s good
-//!        a pose is found |    | two independent families of evidence for 0.3 s (from any of the three)
+//!        a pose is found |    | the pose is wrong, see below (from any of the three)
 //!                        |    v
 //!              RELOCALIZING <-- LOST            STALE: no sensor data, from any of them
 //! ```
+//!
+//! LOST is said when two independent families of evidence speak for it for 0.3 s, when the scan alone is so far off the
+//! walls that no change of the map explains it, and at the update at which the filter itself gives its pose up to search
+//! the map. An opponent does not count: beams that are cut short in excess of those that are too long are left out.
 //!
 //! Pure: it reads no clock. Times are stamps of the sensors' clock, given by the caller. What is good, bad or
 //! lost is in [`Thresholds`].
 
 mod cause;
+mod fit;
 mod metrics;
 mod monitor;
 mod rules;

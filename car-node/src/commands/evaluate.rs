@@ -8,7 +8,9 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use car_node::bag::SensorLog;
-use car_node::evaluate::{ErrorSummary, Outcome, Start, Truth, run as run_over};
+use car_node::evaluate::{
+    ErrorSummary, Fault, FaultKind, FaultReport, Outcome, Start, Truth, run as run_over,
+};
 use car_node::sets::NamedSet;
 use indicatif::{ProgressBar, ProgressStyle};
 use maps::OccupancyGrid;
@@ -34,6 +36,9 @@ struct Report {
     seed: u64,
     #[serde(flatten)]
     outcome: Outcome,
+    /// What the health state said to each `--fault`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    faults: Vec<FaultReport>,
     range_table: RangeTable,
 }
 
@@ -41,12 +46,21 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     if arguments.poses.is_some() && arguments.bag.len() * arguments.seed.len() > 1 {
         bail!("--poses takes the poses of one run: give one --bag and one --seed");
     }
+    let mut faults = arguments.fault.clone();
+    faults.sort_by(|a, b| a.at.total_cmp(&b.at));
     let set = super::load_set(&arguments.params)?;
     let grid = OccupancyGrid::load(&arguments.map)?;
     let logs = arguments
         .bag
         .iter()
-        .map(|bag| Ok((bag, super::read_bag(bag, &arguments.topics)?)))
+        .map(|bag| {
+            let mut log = super::read_bag(bag, &arguments.topics)?;
+            // The last first: cutting a piece out moves all that comes after it.
+            for fault in faults.iter().rev() {
+                fault.apply(&mut log);
+            }
+            Ok((bag, log))
+        })
         .collect::<anyhow::Result<Vec<_>>>()?;
     let before = Instant::now();
     let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
@@ -76,6 +90,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
                 bag: (*bag).clone(),
                 params: set.name.clone(),
                 seed,
+                faults: fault_reports(&faults, &outcome),
                 outcome,
                 range_table,
             });
@@ -89,6 +104,32 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
         reports => print_table(reports),
     }
     Ok(())
+}
+
+/// What the state said to each fault. A kidnapping cuts its time out of the log: all that follows is that much earlier.
+fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
+    let mut cut = 0.0;
+    let moved: Vec<Fault> = faults
+        .iter()
+        .map(|fault| {
+            let at = fault.at - cut;
+            if fault.kind == FaultKind::Kidnap {
+                cut += fault.duration;
+            }
+            Fault { at, ..*fault }
+        })
+        .collect();
+    moved
+        .iter()
+        .enumerate()
+        .map(|(index, fault)| {
+            let until = moved.get(index + 1).map_or(f64::INFINITY, |next| next.at);
+            FaultReport {
+                fault: faults[index].to_string(),
+                ..FaultReport::new(fault, until, &outcome.state_changes)
+            }
+        })
+        .collect()
 }
 
 fn over_bag(
@@ -231,6 +272,16 @@ fn print_one(report: &Report) {
             percent(truth.recall),
             truth.false_lost,
             truth.false_localized
+        );
+    }
+    for fault in &report.faults {
+        let after = |seconds: Option<f64>| seconds.map_or("never".to_owned(), |s| format!("after {s:.2} s"));
+        say!(
+            "  {:<16} LOST {}, STALE {}, LOCALIZED again {}",
+            fault.fault,
+            after(fault.lost_after_s),
+            after(fault.stale_after_s),
+            after(fault.localized_after_s)
         );
     }
     if let Some(times) = outcome.update_us {

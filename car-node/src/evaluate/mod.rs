@@ -2,6 +2,7 @@
 //! the times taken).
 
 mod errors;
+mod faults;
 mod states;
 mod statistics;
 mod truth;
@@ -14,7 +15,8 @@ use serde::Serialize;
 use synpf::{Dropped, Localizer, SetUpError, Stamp, Update};
 
 pub use errors::{PoseErrors, Summaries};
-pub use states::{StateTruth, States};
+pub use faults::{Fault, FaultKind};
+pub use states::{FaultReport, StateChange, StateTruth, States};
 pub use statistics::{ErrorSummary, mean, percentile};
 pub use truth::Truth;
 
@@ -73,6 +75,8 @@ pub struct Outcome {
     pub errors: Option<Summaries>,
     /// Share of the updates spent in each health state.
     pub state_share: BTreeMap<State, f64>,
+    /// Every change of the health state.
+    pub state_changes: Vec<StateChange>,
     /// What the states are worth, where there is truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub state_truth: Option<StateTruth>,
@@ -116,6 +120,10 @@ pub fn run(
     let mut states = States::default();
 
     for (index, arrival) in arrivals.iter().enumerate() {
+        // A car looks at its clock all the time; a log has one only where something arrives.
+        if scans > 0 && monitor.tick(arrival.log_time).state == State::Stale {
+            states.change(arrival.log_time, State::Stale, None);
+        }
         let result = match &arrival.event {
             SensorEvent::Odometry(odometry) => {
                 latest_odometry = Some(odometry.stamp);
@@ -163,6 +171,7 @@ pub fn run(
         updates: times_us.len(),
         dropped,
         state_share: states.shares(),
+        state_changes: states.changes().to_vec(),
         state_truth: states.truth(),
         errors: (!truth.is_empty()).then(|| errors.summaries()).flatten(),
         alignment: mean(&alignment)

@@ -6,6 +6,7 @@ use maps::{Pose, wrap_angle};
 use serde::Serialize;
 use synpf::Stamp;
 
+use super::Fault;
 use super::errors::SETTLING;
 use crate::health::State;
 
@@ -27,9 +28,62 @@ pub struct StateTruth {
     pub false_localized: usize,
 }
 
+/// A change of the state.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct StateChange {
+    /// When, from the first scan on [s].
+    pub at_s: f64,
+    /// The state from then on.
+    pub state: State,
+    /// True when the estimate was within 0.2 m and 2 deg of the truth; None where that is not known.
+    pub right: Option<bool>,
+}
+
+/// What the state said to a fault.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FaultReport {
+    /// The fault.
+    pub fault: String,
+    /// From its begin until LOST was said; None when it never was, up to the next fault [s].
+    pub lost_after_s: Option<f64>,
+    /// From its begin until STALE was said; None when it never was [s].
+    pub stale_after_s: Option<f64>,
+    /// From its begin until the car was LOCALIZED again after either of them; None when it never was [s].
+    pub localized_after_s: Option<f64>,
+}
+
+impl FaultReport {
+    /// From the changes of the state, of which those until `until` [s] count.
+    pub fn new(fault: &Fault, until: f64, changes: &[StateChange]) -> Self {
+        let during = || {
+            changes
+                .iter()
+                .filter(move |change| (fault.at..until).contains(&change.at_s))
+        };
+        let first = |state: State| {
+            let change = during().find(|change| change.state == state);
+            change.map(|change| change.at_s - fault.at)
+        };
+        let (lost, stale) = (first(State::Lost), first(State::Stale));
+        let bad = lost.into_iter().chain(stale).reduce(f64::min);
+        Self {
+            fault: fault.to_string(),
+            lost_after_s: lost,
+            stale_after_s: stale,
+            localized_after_s: bad.and_then(|bad| {
+                during()
+                    .map(|change| (change.at_s - fault.at, change.state))
+                    .find(|(at, state)| *at > bad && *state == State::Localized)
+                    .map(|(at, _)| at)
+            }),
+        }
+    }
+}
+
 /// Collects states, update by update.
 #[derive(Debug, Default)]
 pub struct States {
+    changes: Vec<StateChange>,
     first: Option<Stamp>,
     counts: BTreeMap<State, usize>,
     judged: usize,
@@ -44,12 +98,14 @@ impl States {
     /// Adds an update.
     pub fn push(&mut self, stamp: Stamp, state: State, estimate: Pose, truth: Option<Pose>) {
         *self.counts.entry(state).or_default() += 1;
+        let right = truth.map(|truth| right(estimate, truth));
+        self.change(stamp, state, right);
         let first = *self.first.get_or_insert(stamp);
         let Some(truth) = truth.filter(|_| stamp.since(first) >= SETTLING) else {
             return;
         };
         let distance = estimate.distance(truth);
-        let right = distance < POSITION && wrap_angle(estimate.heading - truth.heading).abs() < HEADING;
+        let right = right.unwrap_or_default();
         let localized = state == State::Localized;
         self.judged += 1;
         self.right += usize::from(right);
@@ -57,6 +113,23 @@ impl States {
         self.localized_and_right += usize::from(localized && right);
         self.false_lost += usize::from(state == State::Lost && right);
         self.false_localized += usize::from(localized && distance > 1.0);
+    }
+
+    /// Takes note of the state between two updates, as when the sensors fall silent.
+    pub fn change(&mut self, stamp: Stamp, state: State, right: Option<bool>) {
+        let first = *self.first.get_or_insert(stamp);
+        if self.changes.last().is_none_or(|change| change.state != state) {
+            self.changes.push(StateChange {
+                at_s: stamp.since(first),
+                state,
+                right,
+            });
+        }
+    }
+
+    /// Every change of the state.
+    pub fn changes(&self) -> &[StateChange] {
+        &self.changes
     }
 
     /// Share of the updates in each state.
@@ -78,6 +151,11 @@ impl States {
             false_localized: self.false_localized,
         })
     }
+}
+
+/// Whether an estimate is what LOCALIZED promises.
+fn right(estimate: Pose, truth: Pose) -> bool {
+    estimate.distance(truth) < POSITION && wrap_angle(estimate.heading - truth.heading).abs() < HEADING
 }
 
 #[cfg(test)]

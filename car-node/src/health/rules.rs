@@ -1,23 +1,22 @@
 //! The table of metrics against their thresholds: which are bad, and what they speak for.
 
+use super::fit::Fit;
 use super::{CauseKind, Metrics, Severity, Thresholds};
 
-/// Families of evidence. Two metrics of one family rise and fall together, so that they count once; only
-/// evidence of two families makes a car lost.
+/// Families of evidence. Two metrics of one family rise and fall together, so that they count once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Family {
     /// Where the beams end, by the map.
     EndPoints,
-    /// Beams that pass through walls of the map.
+    /// Beams that pass through walls of the map. Only beside the first: a wall that has gone is no wrong pose.
     LongBeams,
-    /// How well scans fit, against how well they used to.
-    Likelihood,
     /// What the particles look like. Never enough to be lost, together with nothing but itself.
     Particles,
 }
 
 impl Family {
-    pub(super) const COUNT: usize = 4;
+    pub(super) const ALL: [Self; 3] = [Self::EndPoints, Self::LongBeams, Self::Particles];
+    pub(super) const COUNT: usize = Self::ALL.len();
 }
 
 /// A metric that is over its limit at one update.
@@ -85,80 +84,109 @@ fn hint(kind: CauseKind, severity: Severity, value: f64, limit: f64) -> Option<F
     })
 }
 
-/// Everything that is over its limit. `raw` is this update alone, `smoothed` has alignment and residual over
-/// time: the first says quickly that a pose is wrong, the second keeps single scans from degrading the state.
-pub(super) fn findings(raw: &Metrics, smoothed: &Metrics, t: &Thresholds) -> Vec<Finding> {
-    // A wrong pose makes beams short and long alike; an opponent only makes them short.
-    let occluded = raw.short_beams > t.short_beams_occluded && raw.long_beams <= t.long_beams_degraded;
-    let fit = if occluded {
-        [None; 3]
-    } else {
-        fit(raw, smoothed, t)
-    };
+/// What an update is judged by.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Evidence<'a> {
+    /// This update alone, but for the ages.
+    pub(super) metrics: &'a Metrics,
+    /// The fit over the last quarter of a second: single scans do not degrade the state.
+    pub(super) slow: Fit,
+    /// The fit over the last tenth of a second: a wrong pose shows soon.
+    pub(super) fast: Fit,
+    /// The state is good now, so that a limit is only crossed where it says; else all must be better than that.
+    pub(super) good: bool,
+}
+
+/// Everything that is over its limit.
+pub(super) fn findings(evidence: &Evidence<'_>, t: &Thresholds) -> Vec<Finding> {
+    let fit = fit(evidence, t);
+    let off_walls = fit.iter().flatten().any(|finding| finding.lost.is_some());
     fit.into_iter()
-        .chain(pose(raw, smoothed, t))
-        .chain(hints(raw, t))
+        .chain([long_beams(evidence, off_walls, t)])
+        .chain(pose(evidence.metrics, t))
+        .chain(hints(evidence, t))
         .flatten()
         .collect()
 }
 
 /// How the scan fits the map; means nothing while an opponent fills the view.
-fn fit(raw: &Metrics, smoothed: &Metrics, t: &Thresholds) -> [Option<Finding>; 3] {
+fn fit(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 2] {
     use Bad::{Above, Below};
-    use CauseKind::{Alignment, Likelihood, Residual};
+    use CauseKind::{Alignment, Residual};
+    let Evidence { slow, fast, good, .. } = evidence;
     let ends = Family::EndPoints;
+    let margin = if *good { 0.0 } else { t.hysteresis };
+    if fast.blocked() > t.blocked_most {
+        return [None; 2];
+    }
+    // What stands in view is far from the walls: the residual cannot tell it from a wrong pose.
+    let residual = (fast.blocked() < t.blocked_some).then(|| {
+        lost(Residual, Above, fast.residual, t.residual_lost, ends).or_else(|| {
+            let limit = t.residual_degraded * (1.0 - margin);
+            degraded(Residual, Above, slow.residual, limit)
+        })
+    });
     [
-        lost(Alignment, Below, raw.alignment, t.alignment_lost, ends)
-            .or_else(|| degraded(Alignment, Below, smoothed.alignment, t.alignment_degraded)),
-        lost(Residual, Above, raw.residual, t.residual_lost, ends)
-            .or_else(|| degraded(Residual, Above, smoothed.residual, t.residual_degraded)),
-        lost(Likelihood, Below, raw.w_ratio, t.w_ratio_lost, Family::Likelihood)
-            .or_else(|| degraded(Likelihood, Below, raw.w_ratio, t.w_ratio_degraded)),
+        lost(Alignment, Below, fast.clear_alignment(), t.alignment_lost, ends).or_else(|| {
+            let limit = t.alignment_degraded + margin;
+            degraded(Alignment, Below, slow.clear_alignment(), limit)
+        }),
+        residual.flatten(),
     ]
+}
+
+/// Beams through walls: where the scan lies on the walls all the same, the map is out of date.
+fn long_beams(evidence: &Evidence<'_>, off_walls: bool, t: &Thresholds) -> Option<Finding> {
+    let (kind, share) = (CauseKind::LongBeams, evidence.fast.long_beams);
+    if off_walls {
+        lost(kind, Bad::Above, share, t.long_beams, Family::LongBeams)
+    } else {
+        hint(kind, Severity::Info, share, t.long_beams)
+    }
 }
 
 /// What else speaks against the pose.
-fn pose(raw: &Metrics, smoothed: &Metrics, t: &Thresholds) -> [Option<Finding>; 7] {
-    use Bad::{Above, Below};
-    use CauseKind::{Age, EffectiveSampleSize, Innovation, LongBeams, SecondMode, SpreadAcross, SpreadAlong};
+fn pose(metrics: &Metrics, t: &Thresholds) -> [Option<Finding>; 5] {
+    use Bad::Above;
+    use CauseKind::{Age, Innovation, SecondMode, SpreadAcross, SpreadAlong};
+    let m = metrics;
     [
-        lost(
-            LongBeams,
-            Above,
-            raw.long_beams,
-            t.long_beams_lost,
-            Family::LongBeams,
-        )
-        .or_else(|| degraded(LongBeams, Above, raw.long_beams, t.long_beams_degraded)),
-        degraded(EffectiveSampleSize, Below, raw.ess_ratio, t.ess_degraded),
-        degraded(SpreadAcross, Above, raw.spread_across, t.spread_across_degraded),
-        degraded(SpreadAlong, Above, raw.spread_along, t.spread_along_degraded),
+        degraded(SpreadAcross, Above, m.spread_across, t.spread_across_degraded),
+        degraded(SpreadAlong, Above, m.spread_along, t.spread_along_degraded),
         lost(
             SecondMode,
             Above,
-            raw.second_mode,
+            m.second_mode,
             t.second_mode_lost,
             Family::Particles,
         )
-        .or_else(|| degraded(SecondMode, Above, raw.second_mode, t.second_mode_degraded)),
-        degraded(Innovation, Above, raw.innovation, t.innovation)
-            .or_else(|| degraded(Innovation, Above, raw.innovation_angle.abs(), t.innovation_angle)),
-        degraded(Age, Above, smoothed.age_p50, t.age),
+        .or_else(|| degraded(SecondMode, Above, m.second_mode, t.second_mode_degraded)),
+        degraded(Innovation, Above, m.innovation, t.innovation)
+            .or_else(|| degraded(Innovation, Above, m.innovation_angle.abs(), t.innovation_angle)),
+        degraded(Age, Above, m.age_p50, t.age),
     ]
 }
 
-fn hints(raw: &Metrics, t: &Thresholds) -> [Option<Finding>; 4] {
-    use CauseKind::{NoReturn, Occluded, Slip, YawRate};
+fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
+    use CauseKind::{EffectiveSampleSize, Likelihood, NoReturn, Occluded, Slip, YawRate};
+    let m = evidence.metrics;
+    let below = |kind, value: f64, limit: f64| {
+        (value < limit).then_some(Finding {
+            kind,
+            severity: Severity::Info,
+            value,
+            limit,
+            degrades: false,
+            lost: None,
+        })
+    };
     [
-        hint(Slip, Severity::Warning, raw.slip, t.slip_severe)
-            .or_else(|| hint(Slip, Severity::Info, raw.slip, t.slip)),
-        hint(
-            YawRate,
-            Severity::Info,
-            raw.yaw_rate_residual,
-            t.yaw_rate_residual,
-        ),
-        hint(Occluded, Severity::Info, raw.short_beams, t.short_beams_occluded),
-        hint(NoReturn, Severity::Info, raw.no_return, t.no_return_info),
+        hint(Slip, Severity::Warning, m.slip, t.slip_severe)
+            .or_else(|| hint(Slip, Severity::Info, m.slip, t.slip)),
+        hint(YawRate, Severity::Info, m.yaw_rate_residual, t.yaw_rate_residual),
+        hint(Occluded, Severity::Info, evidence.fast.blocked(), t.blocked_some),
+        hint(NoReturn, Severity::Info, m.no_return, t.no_return_info),
+        below(EffectiveSampleSize, m.ess_ratio, t.ess_info),
+        below(Likelihood, m.w_ratio, t.w_ratio_info),
     ]
 }

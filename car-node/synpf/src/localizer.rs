@@ -509,11 +509,15 @@ impl Localizer {
             }
             self.settled = self.settled.saturating_add(1);
             let recovery = &self.parameters.recovery;
-            self.w_ratio = self.doubt.push(quality.alignment.max(0.02), recovery);
+            self.w_ratio = self.doubt.push(quality.clear_alignment().max(0.02), recovery);
             let lost = self.settled > 10
-                && self
-                    .doubt
-                    .lost(quality.alignment, quality.long, quality.short, seconds, recovery);
+                && self.doubt.lost(
+                    quality.clear_alignment(),
+                    quality.long,
+                    quality.short,
+                    seconds,
+                    recovery,
+                );
             if recovery.recover && lost {
                 self.relocalize();
             } else if !(recovery.recover && self.settled > 10 && self.better_elsewhere(&quality, seconds)) {
@@ -549,14 +553,20 @@ impl Localizer {
     /// Whether the scan fits another place of the map clearly better; if so, the search has begun.
     fn better_elsewhere(&mut self, quality: &Quality, seconds: f64) -> bool {
         if !self.doubt.asks(
-            quality.alignment,
+            quality.clear_alignment(),
             self.w_ratio,
             seconds,
             &self.parameters.recovery,
         ) {
             return false;
         }
-        match Search::second_opinion(&self.map, &self.scan, self.estimate.pose, &self.parameters) {
+        match Search::second_opinion(
+            &self.map,
+            &self.scan,
+            self.estimate.pose,
+            self.doubt.sudden(),
+            &self.parameters,
+        ) {
             Some(search) => {
                 self.relocalize();
                 self.search = search;

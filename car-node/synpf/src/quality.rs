@@ -31,6 +31,13 @@ const ALIGNED: f32 = 0.10;
 const OTHER: f32 = 0.3;
 
 impl Quality {
+    /// Alignment of the beams that nothing in view has cut short. A wrong pose makes beams short and long alike, an
+    /// opponent only makes them short: so it is those in excess of the long ones that do not count.
+    pub(crate) fn clear_alignment(&self) -> f64 {
+        let blocked = (self.short - self.long).clamp(0.0, 0.8);
+        (self.alignment / (1.0 - blocked)).min(1.0)
+    }
+
     /// Judges a scan at a pose in the grid's frame.
     pub(crate) fn new(map: &TrackMap, scan: &ReadyScan, pose: Pose, base_link_from_laser: Pose) -> Self {
         let field = map.field();

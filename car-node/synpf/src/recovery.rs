@@ -71,6 +71,10 @@ impl RecoveryParameters {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Doubt {
     averages: Option<[f64; 2]>,
+    /// The short-term average at the last scans, the newest first.
+    recent: [f64; SUDDEN_SCANS],
+    /// For how much longer the last sudden fall counts [s].
+    sudden_for: f64,
     /// For how long the pose has looked wrong [s].
     wrong_for: f64,
     /// For how long the fit has been below what it used to be [s].
@@ -78,6 +82,16 @@ pub(crate) struct Doubt {
     /// Time until the rest of the map may be looked at again [s], and how long to wait the next time.
     patience: [f64; 2],
 }
+
+/// A car that was carried away fits worse from one scan to the next; a map that is out of date, or an opponent that
+/// comes into view, makes the fit fall slowly. Sudden is a fall by this share of the long-term average...
+const SUDDEN_FALL: f64 = 0.16;
+
+/// ...within this many scans.
+const SUDDEN_SCANS: usize = 6;
+
+/// How long a sudden fall is a reason to doubt the pose [s].
+const SUDDEN_FOR: f64 = 1.0;
 
 /// Alignment of a localized car on a map of usual quality: what the averages start from, so that a pose that was
 /// wrong from the start is doubted too.
@@ -94,6 +108,15 @@ impl Doubt {
         let [slow, fast] = self.averages.unwrap_or([USUAL; 2]);
         let slow = slow + parameters.alpha_slow * (likelihood - slow);
         let fast = fast + parameters.alpha_fast * (likelihood - fast);
+        if self.averages.is_none() {
+            self.recent = [fast; SUDDEN_SCANS];
+        }
+        self.recent.rotate_right(1);
+        self.recent[0] = fast;
+        let highest = self.recent.into_iter().fold(0.0, f64::max);
+        if highest - fast > SUDDEN_FALL * slow {
+            self.sudden_for = SUDDEN_FOR;
+        }
         self.averages = Some([slow, fast]);
         if slow > 0.0 { fast / slow } else { 1.0 }
     }
@@ -131,6 +154,7 @@ impl Doubt {
         parameters: &RecoveryParameters,
     ) -> bool {
         let [wait, next] = self.patience;
+        self.sudden_for = (self.sudden_for - seconds).max(0.0);
         self.patience[0] = (wait - seconds).max(0.0);
         if ratio > parameters.doubt_ratio || alignment > 0.85 {
             self.doubted_for = 0.0;
@@ -146,6 +170,11 @@ impl Doubt {
         let wait = (2.0 * next).clamp(0.1, MOST_PATIENCE);
         self.patience = [wait, wait];
         true
+    }
+
+    /// True for a while after the fit has fallen from one moment to the next.
+    pub(crate) fn sudden(&self) -> bool {
+        self.sudden_for > 0.0
     }
 
     /// Starts anew, because the pose has been set or found.
@@ -174,6 +203,27 @@ mod tests {
             ratio = doubt.push(0.2, &parameters);
         }
         assert!(ratio > 0.95, "{ratio}");
+    }
+
+    #[test]
+    fn a_fall_is_sudden_or_it_is_not() {
+        let parameters = RecoveryParameters::default();
+        // Falls from 0.9 to 0.5 within so many scans.
+        let falls = |scans: i32| {
+            let mut doubt = Doubt::default();
+            for _ in 0..200 {
+                doubt.push(0.9, &parameters);
+            }
+            (0..=scans + 3).any(|scan| {
+                doubt.push(
+                    0.9 - 0.4 * f64::from(scan.min(scans)) / f64::from(scans),
+                    &parameters,
+                );
+                doubt.sudden()
+            })
+        };
+        assert!(falls(1), "carried away");
+        assert!(!falls(40), "into a part of the map that is out of date");
     }
 
     #[test]

@@ -185,6 +185,7 @@ impl Search {
         map: &TrackMap,
         scan: &ReadyScan,
         pose: Pose,
+        sudden: bool,
         parameters: &Parameters,
     ) -> Option<Self> {
         let mut search = Self {
@@ -194,6 +195,12 @@ impl Search {
         search.rank(parameters.search.search_candidates);
         let best = search.candidates.first()?;
         let own = score(map, scan, pose);
+        // One scan often fits several places of a large map, and where something stands in view or the map is out of
+        // date, another one better: a pose that explains the scan in good part is not given up for that, unless the fit
+        // has fallen from one scan to the next.
+        if explains(own) && !sudden {
+            return None;
+        }
         let elsewhere = !same(best.estimate.pose, pose);
         (elsewhere && best.score >= own + parameters.search.search_margin).then_some(search)
     }

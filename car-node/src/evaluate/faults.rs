@@ -1,0 +1,301 @@
+//! Things that go wrong on a track, done to a log: what the health state says to them can then be measured.
+
+use std::f64::consts::FRAC_PI_4;
+use std::fmt;
+use std::str::FromStr;
+
+use maps::Pose;
+use serde::Serialize;
+use synpf::{Scan, Stamp};
+
+use crate::bag::{Arrival, SensorEvent, SensorLog};
+
+/// What goes wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FaultKind {
+    /// The car is carried on to where it is at the fault's end, and odometry does not notice: this much of the log is
+    /// cut out.
+    Kidnap,
+    /// No scans come in.
+    NoScans,
+    /// No odometry comes in.
+    NoOdometry,
+    /// A car drives 0.7 m ahead and blocks the middle 90 deg of the view.
+    Blocked,
+    /// Half of the walls are black tubes: in stripes of 10 deg, every other one returns nothing.
+    BlackTubes,
+}
+
+impl FaultKind {
+    const NAMES: [(Self, &'static str); 5] = [
+        (Self::Kidnap, "kidnap"),
+        (Self::NoScans, "no-scans"),
+        (Self::NoOdometry, "no-odometry"),
+        (Self::Blocked, "blocked"),
+        (Self::BlackTubes, "black-tubes"),
+    ];
+}
+
+/// Something that goes wrong, for a while. In text: `kidnap@20+4`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Fault {
+    /// What.
+    pub kind: FaultKind,
+    /// When, from the first scan on [s].
+    pub at: f64,
+    /// For how long [s].
+    pub duration: f64,
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = FaultKind::NAMES
+            .iter()
+            .find_map(|(kind, name)| (*kind == self.kind).then_some(*name))
+            .expect("every kind has a name");
+        write!(f, "{name}@{}+{}", self.at, self.duration)
+    }
+}
+
+impl FromStr for Fault {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let usage = || {
+            let names = FaultKind::NAMES.map(|(_, name)| name).join(", ");
+            format!("{text:?} is not KIND@SECONDS+SECONDS, as in kidnap@20+4; kinds are {names}")
+        };
+        let (name, times) = text.split_once('@').ok_or_else(usage)?;
+        let (at, duration) = times.split_once('+').ok_or_else(usage)?;
+        let kind = FaultKind::NAMES
+            .iter()
+            .find_map(|(kind, known)| (*known == name).then_some(*kind))
+            .ok_or_else(usage)?;
+        let seconds = |text: &str| {
+            let seconds: f64 = text.parse().map_err(|_| usage())?;
+            if (0.0..1e6).contains(&seconds) {
+                Ok(seconds)
+            } else {
+                Err(usage())
+            }
+        };
+        Ok(Self {
+            kind,
+            at: seconds(at)?,
+            duration: seconds(duration)?,
+        })
+    }
+}
+
+impl Fault {
+    /// Does it to a log. A log without a scan stays as it is.
+    pub fn apply(&self, log: &mut SensorLog) {
+        let Some(first) = log.arrivals.iter().find_map(|arrival| match &arrival.event {
+            SensorEvent::Scan(scan) => Some(scan.stamp),
+            _ => None,
+        }) else {
+            return;
+        };
+        let begin = first.plus(self.at);
+        let within = |stamp: Stamp| (0.0..self.duration).contains(&stamp.since(begin));
+        match self.kind {
+            FaultKind::Kidnap => self.cut(log, begin),
+            FaultKind::NoScans => log
+                .arrivals
+                .retain(|arrival| !(matches!(arrival.event, SensorEvent::Scan(_)) && within(stamp(arrival)))),
+            FaultKind::NoOdometry => log
+                .arrivals
+                .retain(|arrival| matches!(arrival.event, SensorEvent::Scan(_)) || !within(stamp(arrival))),
+            FaultKind::Blocked => on_beams(log, within, |angle, range| {
+                if angle.abs() < FRAC_PI_4 {
+                    *range = range.min(0.7);
+                }
+            }),
+            FaultKind::BlackTubes => on_beams(log, within, |angle, range| {
+                if (angle.to_degrees() / 10.0).floor().rem_euclid(2.0) < 1.0 {
+                    *range = f32::INFINITY;
+                }
+            }),
+        }
+    }
+
+    /// Cuts the fault's time out: what comes later comes that much earlier, and odometry goes on from where it was.
+    fn cut(&self, log: &mut SensorLog, begin: Stamp) {
+        let within = |stamp: Stamp| (0.0..self.duration).contains(&stamp.since(begin));
+        let later = |stamp: Stamp| stamp.since(begin) >= self.duration;
+        log.arrivals.retain(|arrival| !within(stamp(arrival)));
+        let (mut before, mut after) = (None, None);
+        for arrival in &mut log.arrivals {
+            if let SensorEvent::Odometry(odometry) = &mut arrival.event {
+                if later(odometry.stamp) {
+                    let (from, to): (Pose, Pose) = (
+                        *after.get_or_insert(odometry.pose),
+                        *before.get_or_insert(odometry.pose),
+                    );
+                    odometry.pose = to * odometry.pose.since(from);
+                } else {
+                    before = Some(odometry.pose);
+                }
+            }
+            if later(stamp(arrival)) {
+                arrival.log_time = arrival.log_time.plus(-self.duration);
+                let stamp = match &mut arrival.event {
+                    SensorEvent::Scan(scan) => &mut scan.stamp,
+                    SensorEvent::Odometry(odometry) => &mut odometry.stamp,
+                    SensorEvent::YawRate(yaw_rate) => &mut yaw_rate.stamp,
+                };
+                *stamp = stamp.plus(-self.duration);
+            }
+        }
+        log.truth.retain(|(stamp, _)| !within(*stamp));
+        for (stamp, _) in &mut log.truth {
+            if later(*stamp) {
+                *stamp = stamp.plus(-self.duration);
+            }
+        }
+    }
+}
+
+fn stamp(arrival: &Arrival) -> Stamp {
+    match &arrival.event {
+        SensorEvent::Scan(scan) => scan.stamp,
+        SensorEvent::Odometry(odometry) => odometry.stamp,
+        SensorEvent::YawRate(yaw_rate) => yaw_rate.stamp,
+    }
+}
+
+/// Changes every beam of the scans within the fault; `change` gets its direction in the laser's frame [rad].
+fn on_beams(log: &mut SensorLog, within: impl Fn(Stamp) -> bool, change: impl Fn(f64, &mut f32)) {
+    let scans = log
+        .arrivals
+        .iter_mut()
+        .filter_map(|arrival| match &mut arrival.event {
+            SensorEvent::Scan(scan) if within(scan.stamp) => Some(scan),
+            _ => None,
+        });
+    for Scan {
+        angle_min,
+        angle_increment,
+        ranges,
+        ..
+    } in scans
+    {
+        for (beam, range) in ranges.iter_mut().enumerate() {
+            change(*angle_min + beam as f64 * *angle_increment, range);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bag::Topics;
+    use synpf::{Odometry, Twist};
+
+    /// Ten seconds at 1 m/s along x: a scan of four beams and odometry, ten times a second, and the truth.
+    fn log() -> SensorLog {
+        let mut log = SensorLog {
+            arrivals: Vec::new(),
+            mount: None,
+            truth: Vec::new(),
+            topics: Topics::default(),
+        };
+        for tenth in 0..100 {
+            let t = f64::from(tenth) / 10.0;
+            let stamp = Stamp(1_000_000_000).plus(t);
+            let pose = Pose::new(t, 0.0, 0.0);
+            let odometry = Odometry {
+                stamp,
+                pose,
+                twist: Twist::default(),
+            };
+            let scan = Scan {
+                stamp,
+                angle_min: -0.2,
+                angle_increment: 0.15,
+                time_increment: 0.0,
+                range_min: 0.1,
+                range_max: 10.0,
+                ranges: vec![5.0; 4],
+            };
+            for event in [SensorEvent::Odometry(odometry), SensorEvent::Scan(scan)] {
+                let log_time = stamp.plus(0.02);
+                log.arrivals.push(Arrival { log_time, event });
+            }
+            log.truth.push((stamp, pose));
+        }
+        log
+    }
+
+    fn after(fault: &str) -> SensorLog {
+        let mut log = log();
+        fault.parse::<Fault>().expect("a fault").apply(&mut log);
+        log
+    }
+
+    #[test]
+    fn a_kidnapped_car_is_elsewhere_and_its_odometry_and_clocks_have_not_noticed() {
+        let log = after("kidnap@4+3");
+        assert_eq!(log.arrivals.len(), 140);
+        let odometry: Vec<_> = log
+            .arrivals
+            .iter()
+            .filter_map(|arrival| match &arrival.event {
+                SensorEvent::Odometry(odometry) => Some(odometry),
+                _ => None,
+            })
+            .collect();
+        let truth = |stamp| log.truth.iter().find(|(at, _)| *at == stamp).expect("known").1;
+        for pair in odometry.windows(2) {
+            assert!((pair[1].stamp.since(pair[0].stamp) - 0.1).abs() < 1e-9);
+            assert!(pair[1].pose.x - pair[0].pose.x < 0.11);
+        }
+        let last = odometry.last().expect("some");
+        // The first step after the cut is lost with it.
+        assert!((truth(last.stamp).x - last.pose.x - 3.1).abs() < 1e-9);
+        assert!(
+            log.arrivals
+                .windows(2)
+                .all(|pair| pair[0].log_time <= pair[1].log_time)
+        );
+    }
+
+    #[test]
+    fn sensors_fall_silent_for_as_long_as_was_said() {
+        assert_eq!(after("no-scans@2+1.5").arrivals.len(), 185);
+        assert_eq!(after("no-odometry@2+1.5").arrivals.len(), 185);
+    }
+
+    #[test]
+    fn beams_are_blocked_and_swallowed_only_meanwhile() {
+        let ranges = |log: &SensorLog, index: usize| match &log.arrivals[index].event {
+            SensorEvent::Scan(scan) => scan.ranges.clone(),
+            _ => panic!("no scan"),
+        };
+        let blocked = after("blocked@1+1");
+        assert_eq!(ranges(&blocked, 21), [0.7; 4]);
+        assert_eq!(ranges(&blocked, 41), [5.0; 4]);
+        // At -11, -3, 6 and 14 degrees.
+        let tubes = after("black-tubes@1+1");
+        assert_eq!(ranges(&tubes, 21), [f32::INFINITY, 5.0, f32::INFINITY, 5.0]);
+    }
+
+    #[test]
+    fn text_and_fault_are_the_same() {
+        let fault: Fault = "kidnap@20+4".parse().expect("a fault");
+        assert_eq!((fault.at, fault.duration), (20.0, 4.0));
+        assert_eq!(fault.to_string(), "kidnap@20+4");
+        for text in [
+            "",
+            "kidnap",
+            "kidnap@1",
+            "kidnap@-1+2",
+            "kidnap@1+NaN",
+            "flood@1+2",
+        ] {
+            let error = text.parse::<Fault>().expect_err("no fault");
+            assert!(error.contains("black-tubes"), "{error}");
+        }
+    }
+}

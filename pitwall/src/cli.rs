@@ -150,6 +150,22 @@ pub(crate) enum Verb {
         #[arg(long, value_name = "TIME", default_value = "0s", value_parser = duration)]
         at: Duration,
     },
+    /// Tell what a recording says: laps, sectors, alignment, load, true error; with figures as one HTML file.
+    Report {
+        /// The recording.
+        file: PathBuf,
+        /// The page; FILE.html unless given.
+        #[arg(short, long, value_name = "FILE")]
+        output: Option<PathBuf>,
+    },
+    /// Write a recording's poses, truth, health and laps as CSV files.
+    Export {
+        /// The recording.
+        file: PathBuf,
+        /// The new folder; FILE.csv unless given.
+        #[arg(short, long, value_name = "FOLDER")]
+        output: Option<PathBuf>,
+    },
     /// Repair a recording that was cut off.
     Recover {
         /// The damaged file; it stays as it is.

@@ -20,6 +20,7 @@ mod link;
 mod log;
 mod recording;
 mod replay;
+mod report;
 #[cfg(feature = "rerun")]
 mod rerun_view;
 mod stream;
@@ -42,6 +43,7 @@ pub use recording::{
     recover,
 };
 pub use replay::{Replay, ReplayView};
+pub use report::{CarReport, MeanSigma, Report, TableRow, TrueError};
 #[cfg(feature = "rerun")]
 pub use rerun_view::{RerunError, RerunOutlet, RerunView};
 pub use stream::{Stream, StreamView};

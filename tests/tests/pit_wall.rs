@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use pitwall::{Hub, Verdict, read_events, unix_now};
+use pitwall::{Hub, Report, Verdict, read_events, unix_now};
 use protocol::{Action, CarName, Outcome, ParamsAction, Topic};
 use system_tests::{Behaviour, DEADLINE, FakeCar, client, free_endpoint, router, wait_until};
 
@@ -212,6 +212,30 @@ async fn a_recording_of_three_cars_holds_every_message() {
         assert_eq!(car.last_lap_s, live.last_lap_s);
     }
     assert_eq!(replayed.cars().count(), 3);
+
+    // What a report makes of it stands alone.
+    let report = Report::of(&file).expect("a good file");
+    assert_eq!(report.cars.len(), 3);
+    for car in &report.cars {
+        assert!(
+            car.laps.len() >= 2 && car.table[0].laps == car.laps.len(),
+            "{car:?}"
+        );
+        assert!(
+            (car.table[0].time_s.mean - 2.0).abs() < 1e-9,
+            "fake cars tell of 2 s"
+        );
+        assert!(
+            car.states["LOCALIZED"] > 0.99 && car.truth.is_none(),
+            "{:?}",
+            car.states
+        );
+    }
+    let page = report.to_html();
+    assert!(page.matches("<svg").count() >= 3 * 5, "figures of each car");
+    for foreign in ["http://", "https://", "<script", "NaN", "inf"] {
+        assert!(!page.contains(foreign), "{foreign} in the page");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -2,9 +2,11 @@
 
 mod cars;
 mod events;
+mod export;
 mod params;
 mod record;
 mod replay;
+mod report;
 mod serve;
 mod steer;
 mod watch;
@@ -52,6 +54,8 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             };
             replay::run(&file, options, speed, at.as_secs_f64(), json).await
         }
+        Verb::Report { file, output } => report::run(&file, output, json),
+        Verb::Export { file, output } => export::run(&file, output, json),
         Verb::Recover { file, output } => record::recover(&file, output, json),
     }
 }

@@ -1,0 +1,128 @@
+//! `pitwall export`: poses and laps as CSV, for spreadsheets and notebooks.
+
+use std::fs::{self, File};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Context;
+use pitwall::{Fleet, Happening, read_events};
+use protocol::{Telemetry, Topic};
+use serde_json::json;
+
+use crate::output;
+
+pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
+    let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
+    // Read before anything is written: a faulty recording leaves nothing behind.
+    let events = read_events(file)?.collect::<Result<Vec<_>, _>>()?;
+    fs::create_dir(&folder).with_context(|| format!("{}: nothing is overwritten", folder.display()))?;
+    let create = |name: &str, head: &str| -> anyhow::Result<BufWriter<File>> {
+        let path = folder.join(name);
+        let mut out = BufWriter::new(File::create_new(&path).with_context(|| path.display().to_string())?);
+        writeln!(out, "{head}")?;
+        Ok(out)
+    };
+    let head =
+        "car,sensor_unix_ns,arrived_unix_ns,x_m,y_m,heading_rad,speed_mps,yaw_rate_radps,s_m,d_m,lap,update";
+    let mut poses = create("poses.csv", head)?;
+    let head = "car,sensor_unix_ns,x_m,y_m,heading_rad";
+    let mut truths = create("truth.csv", head)?;
+    let head = "car,sensor_unix_ns,state,alignment,residual_m,slip,spread_along_m,spread_across_m,particles";
+    let mut healths = create("health.csv", head)?;
+    let mut fleet = Fleet::default();
+    let mut counts = [0_u64; 3];
+    for event in &events {
+        fleet.apply(event);
+        let Happening::Message {
+            topic,
+            header,
+            telemetry,
+            ..
+        } = &event.happening
+        else {
+            continue;
+        };
+        let (car, sensor) = (&event.car, header.sensor);
+        match (&**telemetry, topic) {
+            (Telemetry::Pose(p), Topic::Pose) => {
+                let place = p
+                    .track
+                    .map_or_else(|| ",".to_owned(), |track| format!("{},{}", track.s, track.d));
+                let speed = p.twist.linear_x.hypot(p.twist.linear_y);
+                writeln!(
+                    poses,
+                    "{car},{sensor},{},{},{},{},{speed},{},{place},{},{}",
+                    event.at, p.pose.x, p.pose.y, p.pose.heading, p.twist.angular, p.lap, p.update
+                )?;
+                counts[0] += 1;
+            }
+            (Telemetry::Truth(t), _) => {
+                writeln!(
+                    truths,
+                    "{car},{sensor},{},{},{}",
+                    t.pose.x, t.pose.y, t.pose.heading
+                )?;
+                counts[1] += 1;
+            }
+            (Telemetry::Health(h), Topic::Health) => {
+                let numbers = h.metrics.map_or_else(
+                    || ",,,,,".to_owned(),
+                    |m| {
+                        format!(
+                            "{},{},{},{},{},{}",
+                            m.alignment, m.residual, m.slip, m.spread_along, m.spread_across, m.particles
+                        )
+                    },
+                );
+                writeln!(healths, "{car},{sensor},{},{numbers}", h.state)?;
+                counts[2] += 1;
+            }
+            _ => {}
+        }
+    }
+    let head = "car,lap,time_s,s1_s,s2_s,s3_s,set,slipping,worst_slip,alignment,lateral_m";
+    let mut laps = create("laps.csv", head)?;
+    let lap_count = write_laps(&mut laps, &fleet)?;
+    for mut out in [poses, truths, healths, laps] {
+        out.flush().with_context(|| folder.display().to_string())?;
+    }
+    let [poses, truths, healths] = counts;
+    if json {
+        output::say_json(&json!({
+            "folder": folder, "poses": poses, "truths": truths, "healths": healths, "laps": lap_count,
+        }))?;
+    } else {
+        output::say(&format!(
+            "{}: {poses} poses, {truths} true poses, {healths} health messages, {lap_count} laps",
+            folder.display()
+        ));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// One line a lap; returns how many.
+fn write_laps(laps: &mut impl Write, fleet: &Fleet) -> std::io::Result<u64> {
+    let mut lap_count = 0;
+    for car in fleet.cars() {
+        for lap in car.laps() {
+            let or_empty = |value: Option<f64>| value.map_or_else(String::new, |value| value.to_string());
+            let grip = |of: fn(pitwall::LapGrip) -> f64| or_empty(lap.grip.map(of));
+            let [s1, s2, s3] = lap.sectors_s.map(or_empty);
+            writeln!(
+                laps,
+                "{},{},{},{s1},{s2},{s3},{},{},{},{},{}",
+                car.name,
+                lap.lap,
+                lap.time_s,
+                lap.set,
+                grip(|g| g.slipping),
+                grip(|g| g.worst_slip),
+                grip(|g| g.alignment),
+                or_empty(lap.lateral_m),
+            )?;
+            lap_count += 1;
+        }
+    }
+    Ok(lap_count)
+}

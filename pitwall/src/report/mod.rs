@@ -1,0 +1,458 @@
+//! What a recording says: laps, sectors, how well each car was localized and where, its load, and true error where
+//! the truth was recorded.
+//!
+//! [`Report::of`] turns events into numbers, [`Report::to_html`] those into one page that stands alone.
+#![allow(
+    clippy::format_push_string,
+    reason = "a page is put together once: reading well counts for more than an allocation"
+)]
+mod figures;
+mod html;
+mod svg;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use protocol::{CarName, MapReply, Pose2, State, Telemetry, Topic};
+use serde::Serialize;
+
+use crate::event::{FleetEvent, Happening};
+use crate::fleet::Fleet;
+use crate::laps::Lap;
+use crate::recording::{RecordingError, read_events};
+
+/// Everything that the report says.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// The recording.
+    pub file: String,
+    /// From the first event to the last [s].
+    pub duration_s: f64,
+    /// Each car by name.
+    pub cars: Vec<CarReport>,
+    /// Markers and what else the engineers said or did, in order.
+    pub notes: Vec<String>,
+}
+
+/// One car.
+#[derive(Debug, Clone, Serialize)]
+pub struct CarReport {
+    /// Its name.
+    pub car: CarName,
+    /// Its laps.
+    pub laps: Vec<Lap>,
+    /// Table I of the paper, a row for each set that laps were driven on.
+    pub table: Vec<TableRow>,
+    /// Share of the time in each state, in `[0, 1]`.
+    pub states: BTreeMap<String, f64>,
+    /// Critical log lines.
+    pub alarms: usize,
+    /// Error of the pose against the truth; None where no truth was recorded.
+    pub truth: Option<TrueError>,
+    /// Mean CPU of the node, 1 being one core; None without load messages.
+    pub cpu: Option<f64>,
+    /// The worst update time, 99th percentile over a second [ms]; None without load messages.
+    pub update_p99_ms: Option<f64>,
+    /// Messages that were sent and are not in the recording.
+    pub missing: u64,
+    #[serde(skip)]
+    series: Series,
+}
+
+/// A row of the paper's table I: laps on one set.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TableRow {
+    /// The set in force at the end of these laps.
+    pub set: String,
+    /// How many.
+    pub laps: usize,
+    /// Lap time, mean and standard deviation [s].
+    pub time_s: MeanSigma,
+    /// Mean distance of the estimate from the raceline, over the laps [m]; None without poses.
+    pub lateral_m: Option<MeanSigma>,
+    /// Mean alignment, in `[0, 1]`; None without health messages.
+    pub alignment: Option<f64>,
+}
+
+/// A mean and the standard deviation of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct MeanSigma {
+    /// The mean.
+    pub mean: f64,
+    /// The standard deviation; 0 for a single value.
+    pub sigma: f64,
+}
+
+/// How far the published pose was from the truth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct TrueError {
+    /// Poses compared.
+    pub poses: usize,
+    /// Root mean square distance [m].
+    pub rmse_m: f64,
+    /// Root mean square along the heading [m].
+    pub along_m: f64,
+    /// Root mean square across the heading [m].
+    pub across_m: f64,
+    /// Root mean square of the heading's error [rad].
+    pub heading_rad: f64,
+    /// The greatest distance [m].
+    pub max_m: f64,
+}
+
+/// What figures are drawn from. Times are seconds since the recording's begin.
+#[derive(Debug, Clone, Default)]
+struct Series {
+    map: Option<std::sync::Arc<MapReply>>,
+    length: Option<f64>,
+    poses: Vec<Spot>,
+    healths: Vec<Vital>,
+    loads: Vec<[f64; 3]>,
+    truths: Vec<(i64, Pose2)>,
+}
+
+/// A pose.
+#[derive(Debug, Clone, Copy)]
+struct Spot {
+    sensor: i64,
+    pose: Pose2,
+    /// Place along and off the raceline [m].
+    track: Option<[f64; 2]>,
+}
+
+/// A health message, with the place along the raceline where the car was [m].
+#[derive(Debug, Clone, Copy)]
+struct Vital {
+    at_s: f64,
+    s: Option<f64>,
+    state: State,
+    alignment: f64,
+    slip: f64,
+}
+
+impl MeanSigma {
+    /// None for no value.
+    fn of(values: &[f64]) -> Option<Self> {
+        let count = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / count;
+        let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
+        (!values.is_empty()).then(|| Self {
+            mean,
+            sigma: if values.len() > 1 {
+                (squares / (count - 1.0)).sqrt()
+            } else {
+                0.0
+            },
+        })
+    }
+}
+
+impl Report {
+    /// Reads a whole recording.
+    pub fn of(path: &Path) -> Result<Self, RecordingError> {
+        let mut collector = Collector::default();
+        for event in read_events(path)? {
+            collector.take(&event?);
+        }
+        collector
+            .report(path)
+            .ok_or_else(|| RecordingError::Empty(path.display().to_string()))
+    }
+
+    /// The report as one page, with its figures in it.
+    pub fn to_html(&self) -> String {
+        html::page(self)
+    }
+}
+
+#[derive(Default)]
+struct Collector {
+    fleet: Fleet,
+    span: Option<(i64, i64)>,
+    ticked: i64,
+    series: BTreeMap<CarName, Series>,
+    full_rate: BTreeMap<CarName, Vec<Spot>>,
+}
+
+impl Collector {
+    fn take(&mut self, event: &FleetEvent) {
+        const TICK: i64 = 100_000_000;
+        let (from, _) = *self.span.get_or_insert((event.at, event.at));
+        self.span = Some((from, event.at.max(from)));
+        // Time passes as it did, so that silence is noticed.
+        self.ticked = self.ticked.max(from);
+        while self.ticked + TICK < event.at {
+            self.ticked += TICK;
+            self.fleet.tick(self.ticked);
+        }
+        self.fleet.apply(event);
+        let at_s = (event.at - from) as f64 * 1e-9;
+        let series = self.series.entry(event.car.clone()).or_default();
+        let Happening::Message {
+            topic,
+            header,
+            telemetry,
+            ..
+        } = &event.happening
+        else {
+            return;
+        };
+        match &**telemetry {
+            Telemetry::Pose(pose) => {
+                let spot = Spot {
+                    sensor: header.sensor,
+                    pose: pose.pose,
+                    track: pose.track.map(|track| [track.s, track.d]),
+                };
+                if topic.recorded() {
+                    self.full_rate.entry(event.car.clone()).or_default().push(spot);
+                } else {
+                    series.poses.push(spot);
+                }
+            }
+            Telemetry::Health(health) if *topic == Topic::Health => {
+                if let Some(metrics) = &health.metrics {
+                    series.healths.push(Vital {
+                        at_s,
+                        s: series.poses.last().and_then(|spot| Some(spot.track?[0])),
+                        state: health.state,
+                        alignment: f64::from(metrics.alignment),
+                        slip: f64::from(metrics.slip),
+                    });
+                }
+            }
+            Telemetry::Load(load) => series.loads.push([
+                at_s,
+                f64::from(load.cpu_process),
+                f64::from(load.update_us.p99) * 1e-3,
+            ]),
+            Telemetry::Truth(truth) => series.truths.push((header.sensor, truth.pose)),
+            _ => {}
+        }
+    }
+
+    fn report(mut self, path: &Path) -> Option<Report> {
+        let (from, to) = self.span?;
+        let mut cars = Vec::new();
+        for (name, mut series) in self.series {
+            let car = self.fleet.car(&name)?;
+            // The recorder's own stream has every pose; what came live may have holes.
+            if let Some(full) = self.full_rate.remove(&name)
+                && full.len() > series.poses.len()
+            {
+                series.poses = full;
+            }
+            series.poses.sort_by_key(|spot| spot.sensor);
+            series.truths.sort_by_key(|(at, _)| *at);
+            series.map = car.map.as_ref().map(|(map, _)| map.clone());
+            series.length = car.lap_length();
+            let view = car.view(to);
+            let alarms = self
+                .fleet
+                .log()
+                .since(0)
+                .filter(|line| {
+                    line.car.as_ref() == Some(&name) && line.severity == protocol::Severity::Critical
+                })
+                .count();
+            let mean = |i: usize| {
+                let count = series.loads.len();
+                (count > 0).then(|| series.loads.iter().map(|load| load[i]).sum::<f64>() / count as f64)
+            };
+            cars.push(CarReport {
+                laps: car.laps().to_vec(),
+                table: table(car.laps()),
+                states: states(&series.healths),
+                alarms,
+                truth: true_error(&series.poses, &series.truths),
+                cpu: mean(1),
+                update_p99_ms: series.loads.iter().map(|load| load[2]).max_by(f64::total_cmp),
+                missing: view.streams.values().map(|stream| stream.missing).sum(),
+                car: name,
+                series,
+            });
+        }
+        let notes = self
+            .fleet
+            .log()
+            .since(0)
+            .filter(|line| line.who.is_some() && line.kind != "lap")
+            .map(|line| {
+                let car = line
+                    .car
+                    .as_ref()
+                    .map_or_else(String::new, |car| format!("{car} "));
+                let who = line.who.as_deref().unwrap_or_default();
+                format!(
+                    "{:.1} s: {car}{} [{who}]",
+                    (line.at - from) as f64 * 1e-9,
+                    line.text
+                )
+            })
+            .collect();
+        Some(Report {
+            file: path.display().to_string(),
+            duration_s: (to - from) as f64 * 1e-9,
+            cars,
+            notes,
+        })
+    }
+}
+
+fn table(laps: &[Lap]) -> Vec<TableRow> {
+    let mut sets: BTreeMap<&str, Vec<&Lap>> = BTreeMap::new();
+    for lap in laps {
+        sets.entry(&lap.set).or_default().push(lap);
+    }
+    let row = |(set, laps): (&str, Vec<&Lap>)| {
+        let values = |value: &dyn Fn(&Lap) -> Option<f64>| {
+            let values: Vec<f64> = laps.iter().filter_map(|lap| value(lap)).collect();
+            MeanSigma::of(&values)
+        };
+        Some(TableRow {
+            set: set.to_owned(),
+            laps: laps.len(),
+            time_s: values(&|lap| Some(lap.time_s))?,
+            lateral_m: values(&|lap| lap.lateral_m),
+            alignment: values(&|lap| Some(lap.grip?.alignment)).map(|alignment| alignment.mean),
+        })
+    };
+    sets.into_iter().filter_map(row).collect()
+}
+
+/// Each state lasts from a health message to the next, but not over a pause.
+fn states(healths: &[Vital]) -> BTreeMap<String, f64> {
+    const PAUSE_S: f64 = 1.0;
+    let mut lasted: BTreeMap<String, f64> = BTreeMap::new();
+    for pair in healths.windows(2) {
+        let time = pair[1].at_s - pair[0].at_s;
+        if time < PAUSE_S {
+            *lasted.entry(pair[0].state.to_string()).or_default() += time;
+        }
+    }
+    let all: f64 = lasted.values().sum();
+    lasted
+        .into_iter()
+        .map(|(state, time)| (state, time / all.max(1e-9)))
+        .collect()
+}
+
+/// The truth at a moment, between two samples by the straight line; None further than 50 ms from either.
+fn truth_at(truths: &[(i64, Pose2)], at: i64) -> Option<Pose2> {
+    const NEAR: i64 = 50_000_000;
+    let after = truths.partition_point(|(t, _)| *t < at);
+    let (t1, b) = *truths.get(after)?;
+    if t1 == at {
+        return Some(b);
+    }
+    let (t0, a) = *truths.get(after.checked_sub(1)?)?;
+    let share = (at - t0) as f64 / (t1 - t0) as f64;
+    (at - t0 <= NEAR && t1 - at <= NEAR).then(|| Pose2 {
+        x: a.x + share * (b.x - a.x),
+        y: a.y + share * (b.y - a.y),
+        heading: a.heading + share * maps::wrap_angle(b.heading - a.heading),
+    })
+}
+
+/// `[distance, along, across, heading]` of a pose less the truth [m, m, m, rad].
+fn error_of(spot: &Spot, truths: &[(i64, Pose2)]) -> Option<[f64; 4]> {
+    let truth = truth_at(truths, spot.sensor)?;
+    let (dx, dy) = (spot.pose.x - truth.x, spot.pose.y - truth.y);
+    let (sin, cos) = truth.heading.sin_cos();
+    let heading = maps::wrap_angle(spot.pose.heading - truth.heading);
+    Some([dx.hypot(dy), cos * dx + sin * dy, cos * dy - sin * dx, heading])
+}
+
+fn true_error(poses: &[Spot], truths: &[(i64, Pose2)]) -> Option<TrueError> {
+    let errors: Vec<_> = poses.iter().filter_map(|spot| error_of(spot, truths)).collect();
+    let rms = |i: usize| (errors.iter().map(|e| e[i].powi(2)).sum::<f64>() / errors.len() as f64).sqrt();
+    (!errors.is_empty()).then(|| TrueError {
+        poses: errors.len(),
+        rmse_m: rms(0),
+        along_m: rms(1),
+        across_m: rms(2),
+        heading_rad: rms(3),
+        max_m: errors.iter().map(|e| e[0]).fold(0.0, f64::max),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::laps::LapGrip;
+
+    fn lap(lap: u32, time_s: f64, set: &str) -> Lap {
+        Lap {
+            lap,
+            time_s,
+            set: set.into(),
+            sectors_s: [None; 3],
+            grip: Some(LapGrip {
+                slipping: 0.0,
+                worst_slip: 0.0,
+                alignment: 0.9,
+            }),
+            lateral_m: Some(0.1),
+        }
+    }
+
+    #[test]
+    fn table_one_has_a_row_for_each_set() {
+        let rows = table(&[lap(1, 9.0, "hq"), lap(2, 9.2, "hq"), lap(3, 10.0, "lq")]);
+        assert_eq!(rows.len(), 2);
+        let hq = &rows[0];
+        assert_eq!((hq.set.as_str(), hq.laps), ("hq", 2));
+        assert!((hq.time_s.mean - 9.1).abs() < 1e-9 && (hq.time_s.sigma - 0.02_f64.sqrt()).abs() < 1e-9);
+        assert_eq!(
+            rows[1].time_s,
+            MeanSigma {
+                mean: 10.0,
+                sigma: 0.0
+            }
+        );
+        assert!(table(&[]).is_empty());
+    }
+
+    #[test]
+    fn error_is_split_along_and_across_the_heading() {
+        let quarter = std::f64::consts::FRAC_PI_2;
+        let at = |x, y| Pose2 {
+            x,
+            y,
+            heading: quarter,
+        };
+        let truths = [(0, at(0.0, 0.0)), (20_000_000, at(0.0, 0.2))];
+        let spot = |sensor, x, y| Spot {
+            sensor,
+            pose: at(x, y),
+            track: None,
+        };
+        // Half way the truth is at y = 0.1; the pose is 0.03 behind it and 0.04 to its right.
+        let error = true_error(&[spot(10_000_000, 0.04, 0.07)], &truths).expect("compared");
+        assert!((error.along_m - 0.03).abs() < 1e-9 && (error.across_m - 0.04).abs() < 1e-9);
+        assert!((error.rmse_m - 0.05).abs() < 1e-9 && error.heading_rad.abs() < 1e-9);
+        assert_eq!(
+            true_error(&[spot(500_000_000, 0.0, 0.0)], &truths),
+            None,
+            "the truth had ended"
+        );
+    }
+
+    #[test]
+    fn a_state_lasts_until_the_next_message_and_a_pause_is_nobodys() {
+        let vital = |at_s, state| Vital {
+            at_s,
+            s: None,
+            state,
+            alignment: 1.0,
+            slip: 0.0,
+        };
+        let shares = states(&[
+            vital(0.0, State::Localized),
+            vital(0.3, State::Lost),
+            vital(0.4, State::Localized),
+            vital(60.0, State::Localized),
+        ]);
+        assert!((shares["LOCALIZED"] - 0.75).abs() < 1e-9 && (shares["LOST"] - 0.25).abs() < 1e-9);
+    }
+}

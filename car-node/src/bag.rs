@@ -169,7 +169,7 @@ pub struct Bag {
 pub type StampedPoses = Vec<(Stamp, Pose)>;
 
 /// What a localizer needs of a bag.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct SensorLog {
     /// Every message, in the order it arrived.
     pub arrivals: Vec<Arrival>,

@@ -2,7 +2,6 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use maps::Pose;
 use serde::Serialize;
 use synpf::{Mode, Stamp, Update};
 
@@ -70,7 +69,7 @@ pub struct Monitor {
     good_since: Option<Stamp>,
     /// Driven since the state was entered and since anything was wrong [m].
     driven: f64,
-    last_pose: Option<(Stamp, Pose)>,
+    last_update: Option<Stamp>,
     /// Scans refused in a row.
     refused: u32,
     ages: VecDeque<(Stamp, f64)>,
@@ -99,7 +98,7 @@ impl Monitor {
             wrong_since: None,
             good_since: None,
             driven: 0.0,
-            last_pose: None,
+            last_update: None,
             refused: 0,
             ages: VecDeque::new(),
             before_stale: State::Init,
@@ -129,13 +128,13 @@ impl Monitor {
 
     /// The localizer was given a new pose.
     pub fn on_new_pose(&mut self, now: Stamp) {
-        self.last_pose = None;
+        self.last_update = None;
         self.enter(State::Converging, now);
     }
 
     /// A search of the whole map has begun.
     pub fn on_search(&mut self, now: Stamp) {
-        self.last_pose = None;
+        self.last_update = None;
         self.enter(State::Relocalizing, now);
     }
 
@@ -154,14 +153,15 @@ impl Monitor {
         };
         self.findings = findings(&evidence, &self.thresholds);
         self.count(fast, update.stamp);
-        if let (Some(_), Some((_, pose))) = (self.good_since, self.last_pose) {
-            self.driven += pose.distance(update.pose);
+        // By odometry: the estimate of a wrong pose slides about while the car stands.
+        if let (Some(_), Some(last)) = (self.good_since, self.last_update) {
+            self.driven += update.twist.linear_x.abs() * update.stamp.since(last).max(0.0);
         } else {
             self.driven = 0.0;
         }
         metrics.alignment = slow.alignment;
         metrics.residual = slow.residual;
-        self.last_pose = Some((update.stamp, update.pose));
+        self.last_update = Some(update.stamp);
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
         self.advance(update.mode, update.stamp, now);
@@ -205,8 +205,8 @@ impl Monitor {
     /// The fit with this scan in it, over the longer and the shorter time.
     fn smooth(&mut self, fit: Fit, stamp: Stamp) -> [Fit; 2] {
         let t = &self.thresholds;
-        let smoothed = match (self.fit, self.last_pose) {
-            (Some(before), Some((last, _))) => {
+        let smoothed = match (self.fit, self.last_update) {
+            (Some(before), Some(last)) => {
                 let seconds = stamp.since(last).max(0.0);
                 let step = |before: Fit, time: f64| before.towards(fit, 1.0 - (-seconds / time).exp());
                 [step(before[0], t.smoothing), step(before[1], t.smoothing_lost)]
@@ -365,6 +365,8 @@ impl Monitor {
 mod tests {
     use super::*;
     use crate::health::tests_support::good_update;
+    use maps::Pose;
+    use synpf::Twist;
 
     const SCAN: f64 = 0.025;
 
@@ -387,7 +389,12 @@ mod tests {
 
         fn update(&mut self) -> Update {
             self.number += 1;
+            let twist = Twist {
+                linear_x: 2.0,
+                ..Twist::default()
+            };
             Update {
+                twist,
                 pose: Pose::new(self.number as f64 * 2.0 * SCAN, 0.0, 0.0),
                 ..good_update(self.now, self.number)
             }
@@ -439,7 +446,7 @@ mod tests {
     #[test]
     fn standing_still_confirms_no_pose() {
         let mut drive = Drive::new();
-        let states = drive.drive(5.0, |update| update.pose = Pose::IDENTITY);
+        let states = drive.drive(5.0, |update| update.twist = Twist::default());
         assert_eq!(states, [State::Init, State::Converging]);
         assert_eq!(drive.kinds(), [CauseKind::NewPose]);
     }

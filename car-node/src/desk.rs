@@ -101,8 +101,8 @@ pub fn start(
 ) -> std::io::Result<JoinHandle<()>> {
     thread::Builder::new().name("desk".into()).spawn(move || {
         let mut desk = Loop {
+            answers: Answers::kept(desk.keeper.memory().answers.iter().cloned()),
             desk,
-            answers: Answers::default(),
             sequence: 0,
             update: 0,
             params_due: Instant::now(),
@@ -204,6 +204,15 @@ impl Loop {
             set: self.desk.keeper.reference(),
         };
         self.answers.remember(answer.clone());
+        let changes = matches!(
+            &command.action,
+            Action::Params(action) if !matches!(action, ParamsAction::List | ParamsAction::Shadow { .. })
+        );
+        if changes && matches!(answer.outcome, Outcome::Done { .. }) {
+            // With what it has changed, in one piece.
+            self.desk.keeper.remember(answer.clone());
+            self.save();
+        }
         answer
     }
 
@@ -215,14 +224,12 @@ impl Loop {
             Ok(Decision::Confirmed) => {
                 let set = self.desk.keeper.reference();
                 self.event(EventKind::ParametersConfirmed { set }, Some(command));
-                self.save();
                 self.tell_params();
                 done(None, Reply::Nothing)
             }
             Ok(Decision::Shadow(set)) => self.run_in_shadow(command, set),
             Ok(Decision::Deleted(name)) => {
                 self.event(EventKind::SetDeleted { name }, Some(command));
-                self.save();
                 self.tell_params();
                 done(None, Reply::Nothing)
             }
@@ -281,7 +288,10 @@ impl Loop {
         if doubled {
             self.end_shadow(who, command);
         }
-        self.save();
+        // A command's answer is kept with it, see `obey`.
+        if command.is_none() {
+            self.save();
+        }
         self.tell_params();
         Ok(update)
     }

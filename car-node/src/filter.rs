@@ -19,6 +19,7 @@ use crate::outbox::{CloudSample, Fit, Happening, HealthReport, Outbox, PoseEstim
 use crate::proposal::{Advisor, Proposal};
 use crate::shadow::{Note, Sample, Tap};
 use crate::source::{Belief, Feed, SharedBelief};
+use crate::throttle::Throttle;
 use crate::wire;
 
 /// Something to do between two updates. The answer to each names the first update that it holds for.
@@ -72,6 +73,8 @@ pub struct Shared {
     pub advice: Mutex<Advice>,
     /// What the car believes, for a simulated driver.
     pub belief: SharedBelief,
+    /// What pit walls say of the link, and whether less is sent for it.
+    pub throttle: Mutex<Throttle>,
     /// Name of the set in the shadow: the desk begins it, the shadow's thread may drop it.
     pub shadow: Mutex<Option<String>>,
 }
@@ -84,6 +87,7 @@ impl Default for Shared {
             rates: Mutex::new(DEFAULT_RATES),
             advice: Mutex::default(),
             belief: SharedBelief::default(),
+            throttle: Mutex::default(),
             shadow: Mutex::default(),
         }
     }
@@ -264,12 +268,10 @@ impl Loop {
     }
 
     fn rates(&self) -> Rates {
-        *self
-            .filter
-            .shared
-            .rates
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
+        let shared = &self.filter.shared;
+        let wanted = *shared.rates.lock().unwrap_or_else(PoisonError::into_inner);
+        let throttle = shared.throttle.lock().unwrap_or_else(PoisonError::into_inner);
+        throttle.rates(wanted)
     }
 
     fn obey(&mut self, order: Order) {

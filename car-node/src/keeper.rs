@@ -4,9 +4,9 @@
 //! Changing the set takes two steps: [`Keeper::plan`] says what would be in force, or why not; once the filter
 //! has taken it, [`Keeper::commit`] makes it so. In between nothing has changed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
-use protocol::{ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
+use protocol::{Answer, ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
 use serde::{Deserialize, Serialize};
 use synpf::{Parameters, Stamp};
 
@@ -33,6 +33,10 @@ pub struct Memory {
     pub settled: Option<String>,
     /// The sets that were put on the car, by name.
     pub sets: BTreeMap<String, Stored>,
+    /// The last answers to commands about sets that did something, the newest last: a command that comes again after a
+    /// restart is answered again, and not done again.
+    #[serde(default)]
+    pub answers: VecDeque<Answer>,
 }
 
 /// The set in force.
@@ -99,6 +103,8 @@ pub enum Refusal {
 
 /// A `revert_after` beyond this is a mistake [s].
 const LONGEST_TRIAL: f64 = 3600.0;
+/// Answers that survive a restart.
+const MOST_ANSWERS: usize = 64;
 /// Most sets on one car.
 const MOST_SETS: usize = 64;
 
@@ -133,6 +139,14 @@ impl Keeper {
     /// What must survive a restart.
     pub fn memory(&self) -> &Memory {
         &self.memory
+    }
+
+    /// Keeps an answer over a restart.
+    pub fn remember(&mut self, answer: Answer) {
+        if self.memory.answers.len() >= MOST_ANSWERS {
+            self.memory.answers.pop_front();
+        }
+        self.memory.answers.push_back(answer);
     }
 
     /// The set in force.

@@ -22,4 +22,5 @@ pub mod ros;
 pub mod sets;
 pub mod shadow;
 pub mod source;
+pub mod throttle;
 pub mod wire;

@@ -7,18 +7,21 @@
 //! ```
 
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crossbeam_channel::{Sender, TrySendError, bounded};
 use maps::{Pose, Raceline};
 use protocol::{
-    CarInfo, CarName, ClockReply, ClockRequest, EventKind, Key, Rates, Stamps, Topic, decode, encode,
+    CarInfo, CarName, ClockReply, ClockRequest, EventKind, Key, LinkReport, Rates, Stamps, Topic, decode,
+    encode,
 };
 use synpf::{Localizer, SetUpError, TrackMap};
 use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
+use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
 use crate::clock::{SensorClock, wall_now};
@@ -32,6 +35,7 @@ use crate::publisher::Publisher;
 use crate::sets::{self, NamedSet, SetError};
 use crate::shadow;
 use crate::source::{self, Source};
+use crate::throttle::Change;
 use crate::wire;
 
 /// Where a car begins.
@@ -150,6 +154,7 @@ pub struct Node {
     shadow: JoinHandle<()>,
     publisher: JoinHandle<()>,
     queryables: Vec<Queryable<()>>,
+    reports: Subscriber<()>,
     alive: LivelinessToken,
 }
 
@@ -272,6 +277,7 @@ impl Node {
         )?;
         let load = load::start(Arc::clone(&shared), desk_stops)?;
         let queryables = declare_queryables(&session, &car, session_number, &inquiries, &shared)?;
+        let reports = declare_reports(&session, &car, &shared, clock)?;
         let alive = link::declare_alive(&session, &car)?;
         // The sensors last: from the first scan on, everybody can watch.
         let source = source::play(
@@ -296,6 +302,7 @@ impl Node {
             shadow,
             publisher,
             queryables,
+            reports,
             alive,
         })
     }
@@ -333,6 +340,7 @@ impl Node {
         drop(self.stop_publisher);
         join(self.publisher);
         drop(self.queryables);
+        drop(self.reports);
         drop(self.alive);
         link::close(&self.session, CLOSING);
     }
@@ -447,6 +455,48 @@ fn declare_queryables(
         )?);
     }
     Ok(queryables)
+}
+
+/// Listens to what pit walls say of the link, and sends less while it is slow.
+fn declare_reports(
+    session: &Session,
+    car: &CarName,
+    shared: &Arc<Shared>,
+    clock: SensorClock,
+) -> Result<Subscriber<()>, LinkError> {
+    let key = Key::new(car.clone(), Topic::Link).to_string();
+    let shared = Arc::clone(shared);
+    let take_in = move |sample: Sample| {
+        let Ok((_, report)) = decode::<LinkReport>(&sample.payload().to_bytes()) else {
+            let count = shared.counters.bad_payload() + 1;
+            if count.is_power_of_two() {
+                tracing::warn!(topic = %Topic::Link, count, "a report of the link cannot be read");
+            }
+            return;
+        };
+        let change = shared
+            .throttle
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .on_report(wall_now(), &report);
+        let kind = match change {
+            Some(Change::Lowered { transit, pose }) => EventKind::RatesLowered {
+                transit: transit as f32,
+                pose,
+            },
+            Some(Change::Restored) => EventKind::RatesRestored,
+            None => return,
+        };
+        shared.event(clock.now(), 0, kind, None, None);
+    };
+    session
+        .declare_subscriber(key.clone())
+        .callback(take_in)
+        .wait()
+        .map_err(|error| LinkError::Declare {
+            key,
+            reason: error.to_string(),
+        })
 }
 
 fn answer_clock(query: &Query, session_number: u64, shared: &Shared) {

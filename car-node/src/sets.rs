@@ -102,17 +102,19 @@ pub fn with_values(
             None => drop(merged.insert(key, value)),
         }
     }
-    if !faults.is_empty() {
-        return Err(faults);
-    }
     let parameters = read(merged).map_err(|error| {
         vec![ParameterFault {
             key: "set".into(),
             fault: error.to_string(),
         }]
     })?;
-    parameters.validate()?;
-    Ok(parameters)
+    // What can be read is checked even where something else cannot: every fault is told at once.
+    faults.extend(parameters.validate().err().into_iter().flatten());
+    if faults.is_empty() {
+        Ok(parameters)
+    } else {
+        Err(faults)
+    }
 }
 
 #[cfg(test)]

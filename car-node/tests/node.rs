@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::source::Race;
 use protocol::{
-    Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, Message, Outcome,
+    Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message, Outcome,
     ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Shadow, Stamps, State, Topic, Value,
     decode, encode,
 };
@@ -487,4 +487,44 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
         assert!(last.is_none_or(|last| pose.update == last + 1));
         last = Some(pose.update);
     }
+}
+
+#[test]
+fn a_slow_link_gets_less_and_says_so() {
+    let wall = Wall::open();
+    let (node, car) = start_and_wait("golf", &wall, |_| ());
+    let events = wall.subscribe(&car, Topic::Event);
+    let key = Key::new(car.clone(), Topic::Link).to_string();
+    // A pit wall says once in a while how late poses are, until the car has taken it in.
+    let until = |transit: f32, wanted: fn(&EventKind) -> bool| {
+        let begun = Instant::now();
+        loop {
+            let report = LinkReport {
+                transit,
+                uncertainty: 0.01,
+                poses: 40,
+            };
+            let bytes = encode(&report, Stamps::default()).expect("encodes");
+            wall.session.put(&key, bytes).wait().expect("sends");
+            while let Ok(Some(sample)) = events.recv_timeout(Duration::from_millis(100)) {
+                let (_, event) = decode::<Event>(&sample.payload().to_bytes()).expect("an event");
+                if wanted(&event.kind) {
+                    return event.kind;
+                }
+            }
+            assert!(begun.elapsed() < DEADLINE, "nothing happens");
+        }
+    };
+    let lowered = until(0.9, |kind| matches!(kind, EventKind::RatesLowered { .. }));
+    assert!(lowered.to_string().contains("slow link"), "{lowered}");
+    until(0.01, |kind| *kind == EventKind::RatesRestored);
+    // What is no report is counted.
+    let before = node.shared().counters.read().payloads;
+    wall.session.put(&key, vec![0xff; 9]).wait().expect("sends");
+    let begun = Instant::now();
+    while node.shared().counters.read().payloads == before {
+        assert!(begun.elapsed() < DEADLINE, "not counted");
+        std::thread::yield_now();
+    }
+    node.shutdown("test over");
 }

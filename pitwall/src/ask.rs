@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use protocol::{
     Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Key,
-    MapReply, Message, Outcome, Stamps, Topic, decode, encode,
+    LinkReport, MapReply, Message, Outcome, Stamps, Topic, decode, encode,
 };
 use serde::Serialize;
 use zenoh::query::ConsolidationMode;
@@ -208,6 +208,23 @@ impl Link {
         let (offset, round_trip) = reply.offset_and_round_trip(unix_now());
         self.hand_on(car, Happening::Clock { offset, round_trip });
         Some((offset, round_trip))
+    }
+
+    /// Tells a car how late its poses arrive. One that gets lost is followed by the next.
+    pub(crate) async fn report(&self, car: &CarName, report: &LinkReport) {
+        let key = Key::new(car.clone(), Topic::Link).to_string();
+        let Ok(bytes) = encode(report, stamps()) else {
+            return;
+        };
+        if let Err(error) = self
+            .session
+            .put(&key, bytes)
+            .congestion_control(ASK_CONGESTION)
+            .priority(ASK_PRIORITY)
+            .await
+        {
+            tracing::debug!(%key, %error, "the report could not be sent");
+        }
     }
 
     /// The first reply; None when there is none in time.

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{
-    CarInfo, CarName, Cloud, EventKind, Header, Health, Load, MapReply, Params, Pose, ScanView, Shadow,
-    State, Telemetry, Topic, Truth,
+    CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Params, Pose, ScanView,
+    Shadow, State, Telemetry, Topic, Truth,
 };
 use serde::Serialize;
 
@@ -202,6 +202,18 @@ impl Car {
     /// What must be added to the laptop's clock to get the car's [ns]; 0 until they were compared.
     pub fn clock_offset(&self) -> i64 {
         self.clock.map_or(0, |clock| clock.offset)
+    }
+
+    /// What this pit wall has to tell the car of its link at `now` [unix ns]; None while clocks are not compared, and
+    /// without a pose in the last second.
+    pub fn link_report(&self, now: i64) -> Option<LinkReport> {
+        let clock = self.clock?;
+        let (late, poses) = self.streams.get(&Topic::Pose)?.transit(now)?;
+        Some(LinkReport {
+            transit: (late + clock.offset as f64 * 1e-9) as f32,
+            uncertainty: (clock.round_trip as f64 * 0.5e-9) as f32,
+            poses: u32::try_from(poses).unwrap_or(u32::MAX),
+        })
     }
 
     /// True when nothing comes from the car at `now` [unix ns].

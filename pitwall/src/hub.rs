@@ -24,6 +24,8 @@ pub struct Hub {
 impl Hub {
     /// How often time passes for the fleet.
     const TICK: Duration = Duration::from_millis(100);
+    /// How often a car is told how late its poses arrive.
+    const REPORT_LINKS: Duration = Duration::from_secs(1);
     /// How often clocks are compared.
     const COMPARE_CLOCKS: Duration = Duration::from_secs(2);
     /// How long gaps may take to fill when a recording is about to end.
@@ -158,6 +160,7 @@ impl Hub {
 async fn keep_house(hub: std::sync::Weak<Hub>) {
     let mut ticks = tokio::time::interval(Hub::TICK);
     let mut compared: Option<Instant> = None;
+    let mut reported: Option<Instant> = None;
     loop {
         ticks.tick().await;
         let Some(hub) = hub.upgrade() else {
@@ -171,6 +174,18 @@ async fn keep_house(hub: std::sync::Weak<Hub>) {
                 .map(|car| (car.name.clone(), car.map.is_none(), car.info.is_none()))
                 .collect()
         };
+        if reported.is_none_or(|at| at.elapsed() >= Hub::REPORT_LINKS) {
+            reported = Some(Instant::now());
+            let now = unix_now();
+            let reports: Vec<_> = hub
+                .fleet()
+                .cars()
+                .filter_map(|car| Some((car.name.clone(), car.link_report(now)?)))
+                .collect();
+            for (car, report) in reports {
+                hub.link.report(&car, &report).await;
+            }
+        }
         let compare = compared.is_none_or(|at| at.elapsed() >= Hub::COMPARE_CLOCKS);
         if compare && !cars.is_empty() {
             compared = Some(Instant::now());

@@ -17,7 +17,12 @@ pub struct Stream {
     newest: Option<Header>,
     unreadable: u64,
     late_by: f64,
+    /// Of the last second: when each arrived [unix ns], and how late [s].
+    transits: VecDeque<(i64, f64)>,
 }
+
+/// [ns]
+const SECOND: i64 = 1_000_000_000;
 
 impl Stream {
     /// Messages that a rate is taken over.
@@ -42,6 +47,10 @@ impl Stream {
             self.arrived = at;
             self.newest = Some(*header);
             self.late_by = (at - header.published) as f64 * 1e-9;
+            self.transits.push_back((at, self.late_by));
+            while self.transits.front().is_some_and(|(then, _)| at - then > SECOND) {
+                self.transits.pop_front();
+            }
         }
         newer
     }
@@ -55,6 +64,19 @@ impl Stream {
     /// The newest message's header.
     pub fn newest(&self) -> Option<Header> {
         self.newest
+    }
+
+    /// How late messages arrived in the second before `now` [unix ns], the median by both clocks as they are [s], and how
+    /// many did; None when none did.
+    pub fn transit(&self, now: i64) -> Option<(f64, usize)> {
+        let mut recent: Vec<f64> = self
+            .transits
+            .iter()
+            .filter(|(at, _)| now - at <= SECOND)
+            .map(|(_, late)| *late)
+            .collect();
+        recent.sort_by(f64::total_cmp);
+        Some((*recent.get(recent.len() / 2)?, recent.len()))
     }
 
     /// When the last message arrived [unix ns].
@@ -120,8 +142,6 @@ pub struct StreamView {
 mod tests {
     use super::*;
     use protocol::{Schema, Stamps};
-
-    const SECOND: i64 = 1_000_000_000;
 
     fn header(sequence: u64) -> Header {
         published(sequence, 0)

@@ -12,6 +12,11 @@ const MOST: usize = 512;
 pub(super) struct Answers(VecDeque<Answer>);
 
 impl Answers {
+    /// With those that were kept over a restart.
+    pub(super) fn kept(answers: impl Iterator<Item = Answer>) -> Self {
+        Self(answers.collect())
+    }
+
     /// The answer given to this command.
     pub(super) fn find(&self, id: CommandId) -> Option<&Answer> {
         self.0.iter().rev().find(|answer| answer.id == id)
@@ -19,7 +24,7 @@ impl Answers {
 
     /// Remembers an answer.
     pub(super) fn remember(&mut self, answer: Answer) {
-        if self.0.len() == MOST {
+        if self.0.len() >= MOST {
             self.0.pop_front();
         }
         self.0.push_back(answer);

@@ -1,0 +1,152 @@
+//! Sends less while the link is slow: what cannot get through in time only delays the rest. Pure: the caller brings the
+//! time.
+
+use std::collections::VecDeque;
+
+use protocol::{LinkReport, Rates};
+use synpf::Stamp;
+
+/// Poses that arrive later than this mean a slow link [s]...
+const SLOW: f64 = 0.25;
+/// ...once that has lasted [s].
+const SLOW_FOR: f64 = 2.0;
+/// Poses that arrive sooner than this mean that the link has recovered [s]...
+const FAST: f64 = 0.1;
+/// ...once that has lasted [s].
+const FAST_FOR: f64 = 5.0;
+/// A report counts for this long [s].
+const KEEP: f64 = 3.0;
+/// What is sent at most over a slow link. The full-rate streams for the recorder stay: a recording must be whole.
+const LOWERED: Rates = Rates {
+    pose: 20.0,
+    cloud: 2.0,
+    scan: 1.0,
+    health: 5.0,
+    recorded: true,
+};
+
+/// What has changed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Change {
+    /// The car sends less from now on.
+    Lowered {
+        /// From publishing a pose to its arrival [s].
+        transit: f64,
+        /// Poses per second, at most [Hz].
+        pose: f32,
+    },
+    /// The car sends what it was asked for.
+    Restored,
+}
+
+/// Follows what pit walls say of the link.
+#[derive(Debug, Default)]
+pub struct Throttle {
+    /// The last reports of all pit walls: when, and how late poses arrive [s].
+    reports: VecDeque<(Stamp, f64)>,
+    slow_since: Option<Stamp>,
+    fast_since: Option<Stamp>,
+    lowered: bool,
+}
+
+impl Throttle {
+    /// Takes in a report that came at `now`. Of several pit walls the one that is reached best counts: if even that one
+    /// is late, it is the car's own link that is slow.
+    pub fn on_report(&mut self, now: Stamp, report: &LinkReport) -> Option<Change> {
+        self.reports
+            .push_back((now, f64::from(report.transit - report.uncertainty)));
+        self.reports.retain(|(at, _)| now.since(*at) < KEEP);
+        let best = self
+            .reports
+            .iter()
+            .map(|(_, transit)| *transit)
+            .fold(f64::INFINITY, f64::min);
+        let lasts = |since: &mut Option<Stamp>, holds: bool, time: f64| {
+            if !holds {
+                *since = None;
+                return false;
+            }
+            now.since(*since.get_or_insert(now)) >= time
+        };
+        let slow = lasts(&mut self.slow_since, best > SLOW, SLOW_FOR);
+        let fast = lasts(&mut self.fast_since, best < FAST, FAST_FOR);
+        if slow && !self.lowered {
+            self.lowered = true;
+            Some(Change::Lowered {
+                transit: best,
+                pose: LOWERED.pose,
+            })
+        } else if fast && self.lowered {
+            self.lowered = false;
+            Some(Change::Restored)
+        } else {
+            None
+        }
+    }
+
+    /// What is sent when `wanted` was asked for.
+    pub fn rates(&self, wanted: Rates) -> Rates {
+        if !self.lowered {
+            return wanted;
+        }
+        Rates {
+            pose: wanted.pose.min(LOWERED.pose),
+            cloud: wanted.cloud.min(LOWERED.cloud),
+            scan: wanted.scan.min(LOWERED.scan),
+            health: wanted.health.min(LOWERED.health),
+            recorded: wanted.recorded,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::filter::DEFAULT_RATES;
+
+    /// A report a second for so long, from pit walls that are reached after these times [s].
+    fn report(throttle: &mut Throttle, from: u32, seconds: u32, transits: &[f32]) -> Vec<Change> {
+        (from..from + seconds)
+            .flat_map(|second| transits.iter().map(move |transit| (second, *transit)))
+            .filter_map(|(second, transit)| {
+                let report = LinkReport {
+                    transit,
+                    uncertainty: 0.01,
+                    poses: 40,
+                };
+                throttle.on_report(Stamp(0).plus(f64::from(second)), &report)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_slow_link_gets_less_until_it_has_recovered() {
+        let mut throttle = Throttle::default();
+        assert_eq!(report(&mut throttle, 0, 10, &[0.01]), []);
+        assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
+        let changes = report(&mut throttle, 10, 10, &[0.8]);
+        assert!(
+            matches!(changes[..], [Change::Lowered { pose: 20.0, .. }]),
+            "{changes:?}"
+        );
+        let lowered = throttle.rates(DEFAULT_RATES);
+        assert_eq!((lowered.pose, lowered.cloud, lowered.recorded), (20.0, 2.0, true));
+        // What was asked to be less stays less.
+        let quiet = Rates {
+            pose: 5.0,
+            ..DEFAULT_RATES
+        };
+        assert_eq!(throttle.rates(quiet), Rates { pose: 5.0, ..lowered });
+        assert_eq!(report(&mut throttle, 20, 4, &[0.15]), [], "neither slow nor fast");
+        assert_eq!(report(&mut throttle, 24, 12, &[0.02]), [Change::Restored]);
+        assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
+    }
+
+    #[test]
+    fn a_hiccup_and_a_far_viewer_change_nothing() {
+        let mut throttle = Throttle::default();
+        report(&mut throttle, 0, 3, &[0.01]);
+        assert_eq!(report(&mut throttle, 3, 1, &[2.0]), []);
+        assert_eq!(report(&mut throttle, 4, 20, &[0.01, 1.5]), []);
+    }
+}

@@ -1,0 +1,437 @@
+//! Commands that can be trusted: whatever goes wrong, the car is in a known state, and whoever asked is told which.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::source::Race;
+use pitwall::{Hub, Verdict, new_command_id};
+use protocol::{
+    Action, CarName, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps,
+    Telemetry, Topic, Value, encode,
+};
+use simulator::{CarSetup, Track};
+use synpf::TrackMap;
+use system_tests::{Behaviour, FakeCar, client, free_endpoint, router, wait_until};
+
+/// A whole car on a simulated track.
+fn start(name: &CarName, endpoint: &str, state: Option<&Path>) -> Node {
+    let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
+    let track = Track::load(tracks.join("club")).expect("bundled");
+    let map = RaceMap {
+        name: track.name.clone(),
+        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
+        raceline: Some(Arc::new(track.raceline.clone())),
+    };
+    let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
+    let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
+    config.begin = Begin::Source;
+    config.connect = vec![endpoint.to_owned()];
+    config.state = state.map(Path::to_owned);
+    Node::start(config).expect("a car")
+}
+
+fn named(name: &str) -> CarName {
+    CarName::new(name).expect("a good name")
+}
+
+fn select(name: &str) -> Action {
+    Action::Params(ParamsAction::Select {
+        name: name.into(),
+        revert_after_ms: None,
+    })
+}
+
+fn revision(verdict: &Verdict) -> u64 {
+    match verdict {
+        Verdict::Answered { answer, .. } => answer.set.revision,
+        other => panic!("no answer: {other:?}"),
+    }
+}
+
+/// The set in force as a pit wall knows it.
+fn known(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
+    let fleet = hub.fleet();
+    let params = fleet.car(car)?.params.as_ref()?;
+    Some((params.set.name.clone(), params.revision))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_does() {
+    const SWITCHES: u64 = 1000;
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let events = hub.tap();
+    hub.link().subscribe_recorded(true).await.expect("subscribed");
+    let car = named("car-1");
+    let node = start(&car, &endpoint, None);
+    assert!(
+        hub.wait_until(Duration::from_secs(90), |fleet| {
+            fleet
+                .car(&car)
+                .and_then(|car| car.pose)
+                .is_some_and(|(_, pose)| pose.update > 40)
+        })
+        .await,
+        "the car drives"
+    );
+    let mut expected = known(&hub, &car).map(|(_, revision)| revision);
+    let mut switched_at = Vec::new();
+    for switch in 0..SWITCHES {
+        let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
+        let verdict = hub
+            .link()
+            .command(&car, "ana", expected, select(name))
+            .await
+            .expect("a good command");
+        let Verdict::Answered { answer, .. } = &verdict else {
+            panic!("switch {switch}: {verdict:?}");
+        };
+        let Outcome::Done {
+            update: Some(update), ..
+        } = answer.outcome
+        else {
+            panic!("switch {switch}: {verdict:?}");
+        };
+        assert_eq!(answer.set.name, name);
+        if let Some(expected) = expected {
+            assert_eq!(answer.set.revision, expected + 1, "in order");
+        }
+        expected = Some(answer.set.revision);
+        assert!(switched_at.last().is_none_or(|last| *last <= update), "in order");
+        switched_at.push(update);
+    }
+    let last = *switched_at.last().expect("switches");
+    let dropped = node.shared().counters.read().overrun;
+    let mut poses = Vec::new();
+    wait_until("the updates after the last switch", || {
+        for event in events.try_iter() {
+            if let pitwall::Happening::Message {
+                topic: Topic::RecordedPose,
+                telemetry,
+                ..
+            } = &event.happening
+                && let Telemetry::Pose(pose) = &**telemetry
+            {
+                poses.push((pose.update, pose.pose, pose.twist.linear_x));
+            }
+        }
+        poses.last().is_some_and(|(update, ..)| *update > last + 20)
+    })
+    .await;
+    node.shutdown("test over");
+    hub.close().await;
+    // Every update is there, once and in order.
+    assert!(poses.windows(2).all(|pair| pair[1].0 == pair[0].0 + 1));
+    // A pose steps by what the car has driven. A busy machine may have cost scans, which is no switch's fault.
+    let worst = |at_switch: bool| {
+        poses
+            .windows(2)
+            .filter(|pair| switched_at.contains(&pair[1].0) == at_switch)
+            .map(|pair| {
+                let step = (pair[1].1.x - pair[0].1.x).hypot(pair[1].1.y - pair[0].1.y);
+                step - pair[1].2.abs() * 0.025
+            })
+            .fold(0.0, f64::max)
+    };
+    if dropped == 0 {
+        assert!(
+            worst(true) < 0.1 || worst(true) <= worst(false),
+            "{} m at switches, {} m elsewhere",
+            worst(true),
+            worst(false)
+        );
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
+    let endpoint = free_endpoint();
+    let first = Hub::open(&router(&endpoint)).await.expect("a link");
+    let second = Hub::open(&client(&endpoint)).await.expect("a link");
+    let car = named("car-1");
+    let node = start(&car, &endpoint, None);
+    for hub in [&first, &second] {
+        assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+        wait_until("the set in force is known", || known(hub, &car).is_some()).await;
+    }
+    // Each switches to its own set, expecting what it last knew: of two at once, one is told to look again.
+    let fight = |hub: Arc<Hub>, who: &'static str, name: &'static str| {
+        let car = car.clone();
+        tokio::spawn(async move {
+            let (mut done, mut stale) = (0, 0);
+            for _ in 0..50 {
+                let expected = known(&hub, &car).map(|(_, revision)| revision);
+                let verdict = hub
+                    .link()
+                    .command(&car, who, expected, select(name))
+                    .await
+                    .expect("a good command");
+                match verdict.exit_code() {
+                    0 => done += 1,
+                    6 => stale += 1,
+                    code => panic!("{who}: exit code {code}: {verdict:?}"),
+                }
+            }
+            (done, stale)
+        })
+    };
+    let begun = known(&first, &car).expect("known").1;
+    let ana = fight(first.clone(), "ana", "lq");
+    let ben = fight(second.clone(), "ben", "adaptive");
+    let (ana, ben) = (ana.await.expect("no panic"), ben.await.expect("no panic"));
+    assert_eq!(ana.0 + ana.1 + ben.0 + ben.1, 100);
+    let last = begun + ana.0 + ben.0;
+    wait_until("both know the last revision", || {
+        [&first, &second]
+            .into_iter()
+            .all(|hub| known(hub, &car).is_some_and(|(_, r)| r == last))
+    })
+    .await;
+    assert_eq!(known(&first, &car), known(&second, &car));
+    node.shutdown("test over");
+    second.close().await;
+    first.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_is_not_done_twice_even_across_a_restart() {
+    let endpoint = free_endpoint();
+    let folder = tempfile::tempdir().expect("a folder");
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let car = named("car-1");
+    let node = start(&car, &endpoint, Some(folder.path()));
+    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+    let command = Command {
+        id: new_command_id(),
+        operator: "ana".into(),
+        expected_revision: None,
+        action: select("lq"),
+    };
+    let patience = Duration::from_secs(10);
+    let send = async || {
+        hub.link()
+            .send(&car, &command, patience)
+            .await
+            .expect("a good command")
+    };
+    // The answer is lost on its way: asked again, the car says the same.
+    let done = send().await;
+    let again = send().await;
+    assert_eq!(revision(&done), revision(&again));
+    // The laptop dies while its command is under way: dropping the question is all that the car sees of that.
+    drop(tokio::time::timeout(Duration::ZERO, hub.link().send(&car, &command, patience)).await);
+
+    // The car's process ends, and comes back.
+    node.shutdown("power off");
+    wait_until("the car is gone", || {
+        hub.fleet().car(&car).is_some_and(|car| !car.alive)
+    })
+    .await;
+    let gone = hub
+        .link()
+        .send(&car, &command, Duration::from_secs(1))
+        .await
+        .expect("a good command");
+    assert_eq!(gone.exit_code(), 4, "{gone:?}");
+    assert!(
+        gone.text(&car).contains("nothing has changed"),
+        "{}",
+        gone.text(&car)
+    );
+    let node = start(&car, &endpoint, Some(folder.path()));
+    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+    wait_until("the set in force is known", || {
+        known(&hub, &car).is_some_and(|(name, _)| name == "lq")
+    })
+    .await;
+    let back = hub
+        .link()
+        .command(&car, "ana", None, select("hq"))
+        .await
+        .expect("a good command");
+    let repeated = send().await;
+    assert_eq!(
+        revision(&repeated),
+        revision(&done),
+        "answered again, not done again"
+    );
+    wait_until("hq stays in force", || {
+        known(&hub, &car) == Some(("hq".into(), revision(&back)))
+    })
+    .await;
+    node.shutdown("test over");
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let mute = FakeCar::start(
+        "mute",
+        &endpoint,
+        Behaviour {
+            mute: true,
+            ..Behaviour::default()
+        },
+    )
+    .await;
+    assert!(hub.wait_for(mute.name(), system_tests::DEADLINE).await);
+    let command = |action| Command {
+        id: new_command_id(),
+        operator: "ana".into(),
+        expected_revision: None,
+        action,
+    };
+    let patience = Duration::from_millis(500);
+    let none = hub
+        .link()
+        .send(mute.name(), &command(select("lq")), patience)
+        .await
+        .expect("a good command");
+    assert_eq!(none.exit_code(), 5, "{none:?}");
+    assert!(
+        none.text(mute.name()).contains("that is harmless"),
+        "{}",
+        none.text(mute.name())
+    );
+    let nobody = named("nobody");
+    let gone = hub
+        .link()
+        .send(&nobody, &command(select("lq")), patience)
+        .await
+        .expect("a good command");
+    assert_eq!(gone.exit_code(), 4, "{gone:?}");
+    drop(mute);
+    hub.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let car = named("car-1");
+    let node = start(&car, &endpoint, None);
+    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+    wait_until("the set in force is known", || known(&hub, &car).is_some()).await;
+    let before = known(&hub, &car);
+    let put = |values: &[(&str, Value)]| {
+        let values = values
+            .iter()
+            .map(|(key, value)| ((*key).to_owned(), value.clone()));
+        Action::Params(ParamsAction::Put {
+            set: ParameterSet {
+                name: "mine".into(),
+                values: values.collect(),
+            },
+            revert_after_ms: None,
+        })
+    };
+    let far = Pose2 {
+        x: 1e12,
+        y: 0.0,
+        heading: 0.0,
+    };
+    let absurd = [
+        (put(&[("no_such_thing", Value::Int(1))]), "no_such_thing"),
+        (put(&[("max_particles", Value::Int(-5))]), "max_particles"),
+        (put(&[("max_particles", Value::Int(i64::MAX))]), "max_particles"),
+        (
+            put(&[("max_particles", Value::Text("many".into()))]),
+            "max_particles",
+        ),
+        (put(&[("sigma_hit", Value::Float(0.0))]), "sigma_hit"),
+        (put(&[("sigma_hit", Value::Float(1e300))]), "sigma_hit"),
+        // Contradictory: fewer at most than at least.
+        (
+            put(&[
+                ("max_particles", Value::Int(100)),
+                ("min_particles", Value::Int(1000)),
+            ]),
+            "particles",
+        ),
+        (select("wet"), "no set"),
+        (
+            Action::Params(ParamsAction::Delete { name: "hq".into() }),
+            "ships",
+        ),
+        (Action::Params(ParamsAction::Confirm), "nothing to confirm"),
+        (Action::Pose(far), "off the map"),
+    ];
+    for (action, word) in absurd {
+        let verdict = hub
+            .link()
+            .command(&car, "ana", None, action.clone())
+            .await
+            .expect("a good command");
+        assert_eq!(verdict.exit_code(), 3, "{action:?}: {verdict:?}");
+        let text = verdict.text(&car);
+        assert!(
+            text.contains(word) && text.contains("nothing has changed"),
+            "{text}"
+        );
+    }
+    // Several faults are all told at once.
+    let both = put(&[
+        ("sigma_hit", Value::Float(-1.0)),
+        ("max_particles", Value::Int(-5)),
+    ]);
+    let text = hub
+        .link()
+        .command(&car, "ana", None, both)
+        .await
+        .expect("good")
+        .text(&car);
+    assert!(
+        text.contains("sigma_hit") && text.contains("max_particles"),
+        "{text}"
+    );
+    // What is no number does not even leave the laptop.
+    for value in [f64::NAN, f64::INFINITY] {
+        let error = hub
+            .link()
+            .command(&car, "ana", None, put(&[("sigma_hit", Value::Float(value))]))
+            .await;
+        assert!(error.is_err(), "{error:?}");
+    }
+    let rates = Rates {
+        pose: -1.0,
+        cloud: 0.0,
+        scan: 0.0,
+        health: 0.0,
+        recorded: true,
+    };
+    let error = hub
+        .link()
+        .command(&car, "ana", None, Action::Rates(RatesAction::Set(rates)))
+        .await;
+    assert!(error.is_err(), "{error:?}");
+    assert_eq!(known(&hub, &car), before);
+    node.shutdown("test over");
+    hub.close().await;
+}
+
+#[test]
+fn a_nan_in_a_command_is_refused_by_its_field() {
+    let command = Command {
+        id: new_command_id(),
+        operator: "ana".into(),
+        expected_revision: None,
+        action: Action::Pose(Pose2 {
+            x: f64::NAN,
+            y: 0.0,
+            heading: 0.0,
+        }),
+    };
+    let error = encode(&command, Stamps::default())
+        .expect_err("no number")
+        .to_string();
+    assert!(error.contains('x'), "{error}");
+    // The key that it would have gone under.
+    assert_eq!(
+        Key::new(named("car-1"), command.action.topic()).to_string(),
+        "synpf/v1/car-1/cmd/pose"
+    );
+}

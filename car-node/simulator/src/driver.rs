@@ -19,12 +19,19 @@ pub struct DriverParams {
     pub lookahead_base: f64,
     /// Look-ahead distance per speed [s].
     pub lookahead_gain: f64,
+    /// The line's curvature is read this far ahead in time [s], because servo, tyres and inertia answer late.
+    pub steering_lead: f64,
+    /// Steering against a yaw rate that is not the line's [s].
+    pub yaw_damping: f64,
     /// Least and most look-ahead [m].
     pub lookahead_range: [f64; 2],
     /// Speed over the raceline's own.
     pub speed_scale: f64,
     /// The raceline's speed is read this far ahead in time [s], because the car answers late.
     pub speed_lookahead: f64,
+    /// Most that is asked for beyond the wheels' speed [m/s]: with the motor controller's gain, what they can bring to the
+    /// floor. Asked for more, they spin.
+    pub traction: f64,
     /// Share of the speed given up per metre beside the line [1/m].
     pub error_slowdown: f64,
     /// Distance to keep from a car ahead, bumper to bumper [m].
@@ -37,10 +44,13 @@ impl Default for DriverParams {
             period: Duration::from_millis(20),
             delay: Duration::from_millis(20),
             lookahead_base: 0.25,
-            lookahead_gain: 0.23,
+            lookahead_gain: 0.14,
+            steering_lead: 0.12,
+            yaw_damping: 0.02,
             lookahead_range: [0.6, 3.0],
             speed_scale: 1.0,
             speed_lookahead: 0.10,
+            traction: 0.45,
             error_slowdown: 0.5,
             gap: 0.8,
         }
@@ -99,6 +109,8 @@ pub struct Driver {
 const LOST_HEADING: f64 = 1.4;
 /// A turning manoeuvre ends below this [rad].
 const FOUND_HEADING: f64 = 0.7;
+/// Slower than this [m/s] the tyres roll where they point.
+const SLIPPING: f64 = 0.5;
 /// Speed of manoeuvres [m/s].
 const WALKING: f64 = 0.8;
 /// A manoeuvre's leg.
@@ -144,11 +156,13 @@ impl Driver {
         let Some(estimate) = estimate.filter(|e| e.pose.is_finite()) else {
             return Controls::default();
         };
-        // Where the car will be when the command takes effect.
+        // Where the car will be when the command takes effect, and where it is heading: the rear axle slips sideways.
         let age = (now.as_secs_f64() - estimate.time.as_secs_f64()).clamp(0.0, 0.2);
         let horizon = age + self.params.delay.as_secs_f64();
-        let moved = [estimate.speed, 0.0, estimate.yaw_rate].map(|rate| rate * horizon);
-        let pose = estimate.pose * Pose::exp(moved);
+        let before = line.project([estimate.pose.x, estimate.pose.y]);
+        let sideslip = self.sideslip(estimate.speed, before.s, line);
+        let velocity = [estimate.speed, estimate.speed * sideslip.tan(), estimate.yaw_rate];
+        let pose = estimate.pose * Pose::exp(velocity.map(|rate| rate * horizon));
         let position = line.project([pose.x, pose.y]);
         let off_heading = wrap_angle(pose.heading - position.heading);
         self.decide(now, estimate.speed, off_heading);
@@ -158,7 +172,7 @@ impl Driver {
                 self.note_progress(now, estimate.speed, speed);
                 Controls {
                     speed,
-                    steering: self.steering(pose, estimate.speed, position.s, line),
+                    steering: self.steering(estimate, pose, sideslip, position.s, line),
                 }
             }
             Manoeuvre::Stopping => Controls::default(),
@@ -218,26 +232,73 @@ impl Driver {
         // A decimetre and ten degrees are normal: the car slips.
         let error = (d.abs() - 0.1).max(0.0) + (off_heading.abs() - 0.2).max(0.0);
         let wanted = there * (1.0 - p.error_slowdown * error).clamp(0.3, 1.0);
+        let wanted = wanted.min(speed.max(0.0) + p.traction);
         match ahead {
             Some(ahead) => wanted.min((ahead.speed + 1.5 * (ahead.gap - p.gap)).max(0.0)),
             None => wanted,
         }
     }
 
-    /// Steering angle towards the look-ahead point [rad].
-    fn steering(&self, pose: Pose, speed: f64, s: f64, line: &Raceline) -> f64 {
-        let p = &self.params;
-        let [least, most] = p.lookahead_range;
-        let lookahead = (p.lookahead_base + p.lookahead_gain * speed.max(0.0)).clamp(least, most);
-        // From the middle of the car's wheelbase this distance would be a little less; the gain covers it.
-        let target = line.at(s + lookahead);
-        let [x, y] = pose.inverse().transform([target.x, target.y]);
-        let distance_squared = (x * x + y * y).max(0.01);
-        // The circle through the rear axle, along the heading, to the target.
-        let curvature = 2.0 * y / distance_squared;
-        let speed = speed.max(0.5);
-        self.vehicle.steering_for(speed, speed * speed * curvature)
+    /// Direction in which the rear axle moves, seen from a car that drives along the line at `s` [rad]. From the line and
+    /// not from the measured yaw rate: steering after one's own yawing would make it grow.
+    fn sideslip(&self, speed: f64, s: f64, line: &Raceline) -> f64 {
+        if speed < SLIPPING {
+            return 0.0;
+        }
+        let lateral = speed * speed * line.at(s).curvature;
+        self.vehicle
+            .turn(speed, lateral, self.along(s, line), 0.0)
+            .sideslip
     }
+
+    /// Acceleration along the line that its speeds ask for [m/s^2].
+    fn along(&self, s: f64, line: &Raceline) -> f64 {
+        const REACH: f64 = 0.2;
+        let gain = line.at(s + REACH).speed.powi(2) - line.at(s - REACH).speed.powi(2);
+        gain / (4.0 * REACH) * self.params.speed_scale.powi(2)
+    }
+
+    /// Yaw acceleration that the line's bends ask for [rad/s^2].
+    fn turning_in(&self, s: f64, line: &Raceline) -> f64 {
+        const REACH: f64 = 0.3;
+        let yaw_rate = |s| {
+            let there = line.at(s);
+            there.speed * there.curvature
+        };
+        let per_metre = (yaw_rate(s + REACH) - yaw_rate(s - REACH)) / (2.0 * REACH);
+        line.at(s).speed * per_metre * self.params.speed_scale.powi(2)
+    }
+
+    /// Steering angle [rad]: the line's own curvature, and what the look-ahead point asks for beyond that.
+    fn steering(&self, estimate: &Estimate, pose: Pose, sideslip: f64, s: f64, line: &Raceline) -> f64 {
+        let p = &self.params;
+        let speed = estimate.speed.max(0.5);
+        let [least, most] = p.lookahead_range;
+        let lookahead = (p.lookahead_base + p.lookahead_gain * speed).clamp(least, most);
+        let target = line.at(s + lookahead);
+        let course = Pose::new(pose.x, pose.y, pose.heading + sideslip);
+        // A car on the line would cut the bend towards the same point; only the difference is an error.
+        let here = line.at(s);
+        let on_line = Pose::new(here.x, here.y, here.heading);
+        let ahead = line.at(s + speed * p.steering_lead);
+        let towards = |from: Pose| arc_to(from, [target.x, target.y]);
+        let curvature = ahead.curvature + towards(course) - towards(on_line);
+        let along = self.along(s + speed * p.steering_lead, line);
+        let lateral = speed * speed * curvature;
+        let turn = self
+            .vehicle
+            .turn(speed, lateral, along, self.turning_in(ahead.s, line));
+        // A tail that steps out is caught before it is seen in the position.
+        let now = line.project([estimate.pose.x, estimate.pose.y]);
+        let yaw_error = speed * line.at(now.s).curvature - estimate.yaw_rate;
+        turn.steering + p.yaw_damping * yaw_error
+    }
+}
+
+/// Curvature of the circle that starts along `from` and goes through a point [1/m].
+fn arc_to(from: Pose, point: [f64; 2]) -> f64 {
+    let [x, y] = from.inverse().transform(point);
+    2.0 * y / (x * x + y * y).max(0.01)
 }
 
 #[cfg(test)]

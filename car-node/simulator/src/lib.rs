@@ -67,6 +67,6 @@ pub use lidar::{Lidar, LidarParams, Obstacle, Scan};
 pub use odometry::{Gyro, Motion, Odometry, OdometryParams, OdometrySensor, YawSource};
 pub use tire::TireParams;
 pub use track::Track;
-pub use vehicle::{Controls, Grip, Vehicle, VehicleParams, VehicleState, outline};
+pub use vehicle::{Controls, Grip, Turn, Vehicle, VehicleParams, VehicleState, outline};
 pub use walls::{Hit, Surface, Wall, Walls};
 pub use world::{CarSetup, Crash, Guidance, Lap, Message, Output, TICK, Truth, World};

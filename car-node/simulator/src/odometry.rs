@@ -31,8 +31,6 @@ pub struct OdometryParams {
     pub speed_scale: f64,
     /// Standard deviation of a speed reading [m/s].
     pub speed_noise: f64,
-    /// Angle by which the servo's centre is off [rad]; matters to `YawSource::Steering` only.
-    pub steering_offset: f64,
     /// From one gyroscope message to the next.
     pub gyro_period: Duration,
     /// Bias of the gyroscope at the start: standard deviation [rad/s].
@@ -54,7 +52,6 @@ impl Default for OdometryParams {
             yaw_source: YawSource::Gyro,
             speed_scale: 0.01,
             speed_noise: 0.01,
-            steering_offset: 0.01,
             gyro_period: Duration::from_millis(10),
             gyro_bias: 0.003,
             gyro_walk: 0.0003,
@@ -164,9 +161,7 @@ impl OdometrySensor {
         };
         let yaw_rate = match self.params.yaw_source {
             YawSource::Gyro => self.latest_gyro,
-            YawSource::Steering => {
-                speed * (motion.steering + self.params.steering_offset).tan() / self.wheelbase
-            }
+            YawSource::Steering => speed * motion.steering.tan() / self.wheelbase,
         };
         let dt = self.params.period.as_secs_f64();
         let (sin, cos) = self.pose.heading.sin_cos();
@@ -194,7 +189,6 @@ mod tests {
             yaw_source,
             speed_scale: 0.0,
             speed_noise: 0.0,
-            steering_offset: 0.0,
             gyro_bias: 0.0,
             gyro_walk: 0.0,
             gyro_noise: 0.0,

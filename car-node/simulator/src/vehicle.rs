@@ -59,6 +59,8 @@ pub struct VehicleParams {
     pub max_steering: f64,
     /// Fastest change of the steering angle [rad/s].
     pub steering_rate: f64,
+    /// Angle by which the servo's centre is off, left positive: cars are trimmed by eye [rad].
+    pub steering_offset: f64,
     /// The servo's control gain [1/s].
     pub steering_gain: f64,
     /// Length and width of the body [m].
@@ -99,6 +101,7 @@ impl Default for VehicleParams {
             drag: 0.02,
             max_steering: 0.42,
             steering_rate: 6.0,
+            steering_offset: 0.0,
             steering_gain: 40.0,
             body: [0.50, 0.28],
             rear_overhang: 0.09,
@@ -135,20 +138,56 @@ impl VehicleParams {
         [weight * self.rear_axle, weight * self.front_axle]
     }
 
-    /// Steering angle [rad] that holds a steady turn at `speed` [m/s] with `lateral_acceleration` [m/s^2], from the
-    /// tyres' whole curve; what grip cannot give is cut to the front tyres' peak.
-    pub fn steering_for(&self, speed: f64, lateral_acceleration: f64) -> f64 {
+    /// How the car turns at `speed` [m/s] with `lateral` acceleration [m/s^2] while it gains or loses speed by `along`
+    /// [m/s^2] and turns ever faster by `yaw_acceleration` [rad/s^2], from the tyres' whole curve; what grip cannot give is
+    /// cut to a share of the tyres' peak. It is the look-up table of MAP (Becker, Imholz et al., ICRA 2023), computed when
+    /// asked for.
+    pub fn turn(&self, speed: f64, lateral: f64, along: f64, yaw_acceleration: f64) -> Turn {
         let speed = speed.max(0.1);
-        let yaw_rate = lateral_acceleration / speed;
-        let loads = self.static_loads();
-        let force = self.mass * lateral_acceleration / self.wheelbase();
-        // Theoretical slip is the tangent of the slip angle when nothing drives or brakes.
-        let front = self.front_tires.slip_for(loads[0], force * self.rear_axle);
-        let rear = self.rear_tires.slip_for(loads[1], force * self.front_axle);
-        let lateral_speed = self.rear_axle * yaw_rate - speed * rear;
-        let heading_of_front = (lateral_speed + self.front_axle * yaw_rate).atan2(speed);
-        (heading_of_front + front.atan()).clamp(-self.max_steering, self.max_steering)
+        let yaw_rate = lateral / speed;
+        let [front, rear] = self.static_loads();
+        let shift = (self.mass * along * self.cg_height / self.wheelbase()).clamp(-rear, front);
+        let weight = front + rear;
+        // Each axle makes its share of the side force, and of the force along, as much as it is loaded.
+        let couple = self.yaw_inertia * yaw_acceleration / self.wheelbase();
+        let slip = |tires: &TireParams, load: f64, arm: f64, couple: f64| {
+            let across = self.mass * lateral * arm / self.wheelbase() + couple;
+            let force = across.hypot(self.mass * along * load / weight);
+            // Theoretical slip is the tangent of the slip angle, but for the wheels' own slip along.
+            let usable = force.min(USABLE * tires.peak(load));
+            tires.slip_for(load, usable) * across / force.max(1e-9)
+        };
+        let front = slip(
+            &self.front_tires,
+            (front - shift).max(1.0),
+            self.rear_axle,
+            couple,
+        );
+        let rear = slip(
+            &self.rear_tires,
+            (rear + shift).max(1.0),
+            self.front_axle,
+            -couple,
+        );
+        let front_heading = (self.wheelbase() * yaw_rate - speed * rear).atan2(speed);
+        Turn {
+            steering: (front_heading + front.atan()).clamp(-self.max_steering, self.max_steering),
+            sideslip: -rear.atan(),
+        }
     }
+}
+
+/// Share of a tyre's peak force that is asked for: closer to the peak, slip grows much and force no more, and a tyre that
+/// was steered so far answers late when less is needed.
+const USABLE: f64 = 0.82;
+
+/// A turn, as the tyres make it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Turn {
+    /// Steering angle that makes it [rad].
+    pub steering: f64,
+    /// Direction in which the rear axle moves, seen from the car [rad]: it slips out of the turn, so the nose points in.
+    pub sideslip: f64,
 }
 
 /// How well the tyres hold, as the paper measures it: pulling the standing car sideways.
@@ -358,7 +397,8 @@ impl Vehicle {
         let circumference_mass = p.driveline_inertia / (p.wheel_radius * p.wheel_radius);
 
         let (sin_heading, cos_heading) = s.heading.sin_cos();
-        let steering_error = controls.steering.clamp(-p.max_steering, p.max_steering) - s.steering;
+        let asked = controls.steering + p.steering_offset;
+        let steering_error = asked.clamp(-p.max_steering, p.max_steering) - s.steering;
         VehicleState {
             x: s.vx * cos_heading - s.vy * sin_heading,
             y: s.vx * sin_heading + s.vy * cos_heading,
@@ -465,7 +505,7 @@ mod tests {
     fn the_steering_for_a_turn_gives_that_turn() {
         let params = VehicleParams::default();
         for (speed, lateral) in [(2.0, 2.0), (3.0, 4.0), (5.0, 5.0), (6.0, -6.0)] {
-            let vehicle = settled(&params, speed, params.steering_for(speed, lateral));
+            let vehicle = settled(&params, speed, params.turn(speed, lateral, 0.0, 0.0).steering);
             let s = vehicle.state();
             let reached = s.vx * s.yaw_rate;
             // The formula leaves out the tyres' rolling and driving share of the grip.

@@ -46,7 +46,10 @@ pub struct CarSetup {
 impl Default for CarSetup {
     fn default() -> Self {
         Self {
-            vehicle: VehicleParams::default(),
+            vehicle: VehicleParams {
+                steering_offset: 0.01,
+                ..VehicleParams::default()
+            },
             lidar: LidarParams::default(),
             odometry: OdometryParams::default(),
             driver: DriverParams::default(),

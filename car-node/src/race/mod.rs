@@ -51,6 +51,14 @@ impl Quality {
             Self::Lq => Grip::LQ,
         }
     }
+
+    /// Speed over the raceline's own, set for the tyres as the paper's team does; these give its lap times.
+    pub fn speed_scale(self) -> f64 {
+        match self {
+            Self::Hq => 0.995,
+            Self::Lq => 0.986,
+        }
+    }
 }
 
 /// A race.
@@ -64,7 +72,7 @@ pub struct RaceSetup {
     pub quality: Quality,
     /// What every car goes by.
     pub guide: Guide,
-    /// Speed over the raceline's own.
+    /// Speed over the usual one for the tyres.
     pub speed_scale: f64,
     /// Decides every random number.
     pub seed: u64,
@@ -82,7 +90,7 @@ pub fn race(
 ) -> Result<Vec<CarResult>, SetUpError> {
     let mut car = CarSetup::default();
     car.vehicle = car.vehicle.with_grip(setup.quality.grip());
-    car.driver.speed_scale = setup.speed_scale;
+    car.driver.speed_scale = setup.speed_scale * setup.quality.speed_scale();
     let setups: Vec<CarSetup> = (0..setup.cars)
         .map(|index| CarSetup {
             start: car.start - GRID_GAP * index as f64,

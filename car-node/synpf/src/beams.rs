@@ -327,6 +327,7 @@ mod tests {
                         twist,
                     },
                     false,
+                    &crate::slip_model::SlipModel::default(),
                 )
                 .expect("sound");
         }

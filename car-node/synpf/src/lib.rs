@@ -19,6 +19,7 @@ mod refine;
 mod search;
 mod sensor;
 mod slip;
+mod slip_model;
 mod track_map;
 mod weigh;
 

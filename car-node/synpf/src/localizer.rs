@@ -12,9 +12,10 @@ use crate::odometry_track::OdometryTrack;
 use crate::particles::{Belief, Particles};
 use crate::quality::Quality;
 use crate::recovery::Doubt;
-use crate::refine::{Estimate, fit, refine};
+use crate::refine::{Estimate, fit, refine, wall_offset};
 use crate::search::Search;
 use crate::slip::{Slip, SlipWindow};
+use crate::slip_model::SlipModel;
 use crate::weigh::{Ranges, Weigher};
 use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
 
@@ -146,6 +147,9 @@ const CARRY: f64 = 0.25;
 /// A pause between scans after which the motion is uncertain beyond its tuning [s].
 const GAP: f64 = 0.5;
 
+/// How far the speed of wheels that spin or lock may be off, as a share of it.
+const SPINNING_SPEED_ERROR: f64 = 0.6;
+
 /// Reach at which predictions are compared by their fit [m].
 const FIT_REACH: f32 = 0.15;
 
@@ -175,6 +179,9 @@ pub struct Localizer {
     doubt: Doubt,
     slip_window: SlipWindow,
     slip: Slip,
+    slip_model: SlipModel,
+    /// How much nearer the walls stand than the map has them, as learned so far [m].
+    wall_offset: f64,
     w_ratio: f64,
     /// Updates since the pose was set or found, while the doubt is not yet to be trusted.
     settled: u32,
@@ -224,6 +231,8 @@ impl Localizer {
             doubt: Doubt::default(),
             slip_window: SlipWindow::default(),
             slip: Slip::default(),
+            slip_model: SlipModel::default(),
+            wall_offset: 0.0,
             w_ratio: 1.0,
             settled: 0,
             per_odometry: PerOdometry::default(),
@@ -266,6 +275,7 @@ impl Localizer {
         self.doubt.clear();
         self.slip_window.clear();
         self.slip = Slip::default();
+        self.slip_model.forget_pose();
         self.settled = 0;
     }
 
@@ -313,7 +323,8 @@ impl Localizer {
 
     /// Takes in odometry. Cheap.
     pub fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
-        self.track.push(odometry, self.parameters.motion.use_imu)?;
+        self.track
+            .push(odometry, self.parameters.motion.use_imu, &self.slip_model)?;
         if self.parameters.defects.defect_update_per_odometry {
             self.update_per_odometry(odometry);
         }
@@ -382,7 +393,16 @@ impl Localizer {
         let widen = self.widen(seconds);
         let parameters = &self.parameters;
         let noise = self.noise(motion, seconds, widen);
-        let predicted = self.estimate.moved(motion, &noise);
+        let mut predicted = self.estimate.moved(motion, &noise);
+        let learns = parameters.motion.learn_slip && parameters.refinement.refine;
+        let drive = self.track.drive();
+        if learns {
+            self.slip_model
+                .advance(self.estimate.pose, &mut predicted, motion.x, drive, seconds);
+        } else {
+            self.slip_model = SlipModel::default();
+        }
+        let wheels = motion.x / (1.0 - self.slip_model.share(drive));
 
         self.particles.advance(&Motion::new(
             motion,
@@ -396,24 +416,48 @@ impl Localizer {
         let belief = self.particles.belief();
 
         let before = self.estimate.pose;
-        self.estimate = if self.parameters.refinement.refine && sound {
-            self.refined(&predicted, &belief)
+        if self.parameters.refinement.refine && sound {
+            let (estimate, followed) = self.refined(&predicted, &belief);
+            self.estimate = estimate;
+            if learns && followed {
+                self.slip_model.learn(&predicted, &estimate);
+            } else {
+                self.slip_model.forget_pose();
+            }
         } else {
-            Estimate {
+            self.estimate = Estimate {
                 pose: belief.mean,
                 covariance: belief.covariance,
-            }
-        };
+            };
+        }
+        self.learn_walls(motion);
         let innovation = [
             self.estimate.pose.distance(predicted.pose),
             maps::wrap_angle(self.estimate.pose.heading - predicted.pose.heading).abs(),
         ];
         if seconds > 0.0 {
             self.slip_window
-                .push(stamp, seconds, motion, self.estimate.pose.since(before));
+                .push(stamp, seconds, wheels, motion, self.estimate.pose.since(before));
             self.slip = self.slip_window.slip();
         }
         self.report(stamp, twist, Some((belief, seconds)), innovation)
+    }
+
+    /// Learns how far off the map's walls are on the whole. A map's face is the near edge of the cells that end points fell
+    /// into, so walls stand up to a cell behind it, and the fit would be pushed away from whatever is on one side only.
+    fn learn_walls(&mut self, motion: Pose) {
+        /// More is not a map's grain [m].
+        const MOST: f64 = 0.05;
+        let parameters = &self.parameters.refinement;
+        if !parameters.refine || parameters.wall_offset_distance <= 0.0 {
+            self.wall_offset = 0.0;
+            return;
+        }
+        let pose = self.estimate.pose;
+        if let Some(seen) = wall_offset(self.map.field(), &self.scan.points, pose, self.wall_offset) {
+            let gain = 1.0 - (-motion.x.abs() / parameters.wall_offset_distance).exp();
+            self.wall_offset = (self.wall_offset + gain * (seen - self.wall_offset)).clamp(-MOST, MOST);
+        }
     }
 
     /// By how much the noise is wider than tuned: after a pause, and with slip where the set adapts.
@@ -422,7 +466,7 @@ impl Localizer {
         if !self.parameters.motion.adaptive {
             return pause;
         }
-        let slip = self.slip.ratio.abs() / 0.05 + self.slip.yaw_rate.abs() / 0.5;
+        let slip = self.slip.unexplained.abs() / 0.05 + self.slip.yaw_rate.abs() / 0.5;
         pause * (1.0 + slip).min(4.0)
     }
 
@@ -434,7 +478,12 @@ impl Localizer {
             p.diffusion_xy.powi(2) * seconds,
             p.diffusion_heading.powi(2) * seconds,
         ];
-        let along = (p.odometry_speed_error * distance * widen).powi(2) + steady[0];
+        let speed_error = if self.slip_model.spinning() {
+            p.odometry_speed_error.max(SPINNING_SPEED_ERROR)
+        } else {
+            p.odometry_speed_error
+        };
+        let along = (speed_error * distance * widen).powi(2) + steady[0];
         let across = (p.odometry_side_error * distance * widen).powi(2) + steady[0];
         let turn = (p.odometry_yaw_error * motion.heading * widen).powi(2) + steady[1];
         Matrix3::from_diagonal(&Vector3::new(along, across, turn))
@@ -459,8 +508,9 @@ impl Localizer {
         }
     }
 
-    /// The scan fitted around the prediction, or around the particles where they explain the scan better.
-    fn refined(&self, predicted: &Estimate, belief: &Belief) -> Estimate {
+    /// The scan fitted around the prediction, or around the particles where they explain the scan better. Says whether
+    /// the prediction was followed.
+    fn refined(&self, predicted: &Estimate, belief: &Belief) -> (Estimate, bool) {
         let parameters = &self.parameters.refinement;
         let field = self.map.field();
         let fit = |pose| fit(field, &self.scan.points, 60, pose, FIT_REACH);
@@ -469,19 +519,33 @@ impl Localizer {
             covariance: belief.covariance + Matrix3::identity() * 1e-4,
         };
         let own = fit(predicted.pose);
-        let from_predicted = refine(field, &self.scan.points, predicted.pose, predicted, parameters);
+        let from_predicted = refine(
+            field,
+            &self.scan.points,
+            predicted.pose,
+            predicted,
+            self.wall_offset,
+            parameters,
+        );
         let own_refined = fit(from_predicted.pose);
         if fit(particles.pose) > own.max(own_refined) + FIT_MARGIN {
-            let from_particles = refine(field, &self.scan.points, particles.pose, &particles, parameters);
+            let from_particles = refine(
+                field,
+                &self.scan.points,
+                particles.pose,
+                &particles,
+                self.wall_offset,
+                parameters,
+            );
             if fit(from_particles.pose) > own_refined + FIT_MARGIN {
-                return from_particles;
+                return (from_particles, false);
             }
         }
         // A fit that made things worse has run away.
         if own_refined + FIT_MARGIN < own {
-            *predicted
+            (*predicted, true)
         } else {
-            from_predicted
+            (from_predicted, true)
         }
     }
 

@@ -78,12 +78,15 @@ pub struct MotionParameters {
     pub diffusion_xy: f64,
     /// Noise on the heading that is always there [rad/sqrt(s)].
     pub diffusion_heading: f64,
-    /// How far odometry's speed may be off, as a share of it [m/m]; for the refined estimate.
+    /// How far odometry's speed may be off beyond the slip that was learned, as a share of it [m/m]; for the refined
+    /// estimate.
     pub odometry_speed_error: f64,
     /// Sideways motion that odometry does not see, as a share of the distance [m/m]; for the refined estimate.
     pub odometry_side_error: f64,
     /// How far odometry's turning may be off, as a share of it [rad/rad]; for the refined estimate.
     pub odometry_yaw_error: f64,
+    /// Learn the wheels' slip where the walls tell the place, and take it out of odometry; for the refined estimate.
+    pub learn_slip: bool,
     /// Let the noise grow with the slip that the filter sees.
     pub adaptive: bool,
     /// Turn by the gyroscope's yaw rate, where there is one, in place of odometry's.
@@ -118,9 +121,10 @@ impl Default for MotionParameters {
             motion_dispersion_theta: 0.05,
             diffusion_xy: 0.02,
             diffusion_heading: 0.1,
-            odometry_speed_error: 0.15,
+            odometry_speed_error: 0.06,
             odometry_side_error: 0.15,
             odometry_yaw_error: 0.5,
+            learn_slip: true,
             adaptive: false,
             use_imu: true,
         }

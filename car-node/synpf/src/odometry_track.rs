@@ -4,10 +4,11 @@ use std::collections::VecDeque;
 
 use maps::Pose;
 
+use crate::slip_model::{Drive, SlipModel};
 use crate::{Dropped, Odometry, Stamp, Twist, YawRate};
 
-/// The recent odometry. Jumps are taken out and gyroscope turns put in as messages arrive, so that whoever reads
-/// it sees one smooth motion in a frame of its own.
+/// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
+/// whoever reads it sees one smooth motion in a frame of its own.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct OdometryTrack {
     /// Poses in the smooth frame.
@@ -15,6 +16,10 @@ pub(crate) struct OdometryTrack {
     /// The last message as it came.
     last: Option<Odometry>,
     yaw_rates: VecDeque<YawRate>,
+    /// The wheels' speed as it came [m/s], over the last [`ACCELERATING`].
+    speeds: VecDeque<(Stamp, f64)>,
+    /// What the car was doing at the last message.
+    drive: Drive,
     /// Jumps taken out so far.
     pub(crate) jumps: u64,
 }
@@ -30,8 +35,16 @@ const JUMP_RATE: [f64; 2] = [3.0, 3.0];
 /// A gyroscope is silent when its last reading is older than this [s].
 const GYRO_SILENT: f64 = 0.1;
 
+/// Acceleration is taken over this long [s]: shorter is noise, longer is late.
+const ACCELERATING: f64 = 0.08;
+
 impl OdometryTrack {
-    pub(crate) fn push(&mut self, odometry: &Odometry, use_imu: bool) -> Result<(), Dropped> {
+    pub(crate) fn push(
+        &mut self,
+        odometry: &Odometry,
+        use_imu: bool,
+        slip: &SlipModel,
+    ) -> Result<(), Dropped> {
         let Twist {
             linear_x,
             linear_y,
@@ -67,15 +80,33 @@ impl OdometryTrack {
             self.jumps += 1;
             step = expected;
         }
+        let mut arc = step.log();
         if use_imu && let Some(turn) = self.turn_by_gyro(last.stamp, odometry.stamp) {
             // The same arc, turned by the gyroscope.
-            let [x, y, _] = step.log();
-            step = Pose::exp([x, y, turn]);
+            arc[2] = turn;
         }
+        self.drive = Drive {
+            acceleration: self.acceleration(odometry),
+            lateral: odometry.twist.linear_x * arc[2] / dt,
+        };
+        let step = Pose::exp(slip.corrected(arc, self.drive));
+        let [linear_x, linear_y, angular] = slip.corrected(
+            [
+                odometry.twist.linear_x,
+                odometry.twist.linear_y,
+                odometry.twist.angular,
+            ],
+            self.drive,
+        );
         let before = self.points.back().expect("a last message has a point").pose;
         self.last = Some(*odometry);
         self.points.push_back(Odometry {
             pose: before * step,
+            twist: Twist {
+                linear_x,
+                linear_y,
+                angular,
+            },
             ..*odometry
         });
         if self.points.len() > KEPT {
@@ -100,6 +131,33 @@ impl OdometryTrack {
             self.yaw_rates.pop_front();
         }
         Ok(())
+    }
+
+    /// What the car was doing at the last message.
+    pub(crate) fn drive(&self) -> Drive {
+        self.drive
+    }
+
+    /// Notes the wheels' speed and returns their acceleration [m/s^2].
+    fn acceleration(&mut self, odometry: &Odometry) -> f64 {
+        let (now, speed) = (odometry.stamp, odometry.twist.linear_x);
+        self.speeds.push_back((now, speed));
+        while self
+            .speeds
+            .get(1)
+            .is_some_and(|(stamp, _)| now.since(*stamp) >= ACCELERATING)
+        {
+            self.speeds.pop_front();
+        }
+        let (then, before) = self.speeds[0];
+        let seconds = now.since(then);
+        // Neither from a single reading, nor over a gap.
+        if (ACCELERATING / 2.0..2.0 * ACCELERATING).contains(&seconds) {
+            // More than any tyre of this kind can do is a fault of the reading.
+            ((speed - before) / seconds).clamp(-15.0, 15.0)
+        } else {
+            0.0
+        }
     }
 
     /// The turn from one stamp to another by the gyroscope [rad], held between readings; None if it was silent.
@@ -192,7 +250,7 @@ mod tests {
     fn track(messages: impl IntoIterator<Item = Odometry>) -> OdometryTrack {
         let mut track = OdometryTrack::default();
         for message in messages {
-            track.push(&message, true).expect("sound");
+            track.push(&message, true, &SlipModel::default()).expect("sound");
         }
         track
     }
@@ -238,7 +296,7 @@ mod tests {
                 pose: moved(&twist, i as f64 * 0.02),
                 twist,
             };
-            track.push(&odometry, true).expect("sound");
+            track.push(&odometry, true, &SlipModel::default()).expect("sound");
         }
         let (pose, _) = track.at(Stamp(1_000_000_000), 0.0).expect("covered");
         assert!((pose.heading - 0.5).abs() < 0.02, "{pose:?}");
@@ -247,13 +305,22 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused() {
         let mut track = track((0..3).map(circle));
-        assert_eq!(track.push(&circle(2), true), Err(Dropped::TimeBackwards));
+        assert_eq!(
+            track.push(&circle(2), true, &SlipModel::default()),
+            Err(Dropped::TimeBackwards)
+        );
         let mut nan = circle(3);
         nan.pose.x = f64::NAN;
-        assert_eq!(track.push(&nan, true), Err(Dropped::Malformed));
+        assert_eq!(
+            track.push(&nan, true, &SlipModel::default()),
+            Err(Dropped::Malformed)
+        );
         let mut absurd = circle(3);
         absurd.twist.linear_x = 1e9;
-        assert_eq!(track.push(&absurd, true), Err(Dropped::Malformed));
-        assert_eq!(track.push(&circle(3), true), Ok(()));
+        assert_eq!(
+            track.push(&absurd, true, &SlipModel::default()),
+            Err(Dropped::Malformed)
+        );
+        assert_eq!(track.push(&circle(3), true, &SlipModel::default()), Ok(()));
     }
 }

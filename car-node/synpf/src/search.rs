@@ -125,6 +125,7 @@ impl Search {
                 &scan.points,
                 prior.pose,
                 &prior,
+                0.0,
                 &parameters.refinement,
             );
             let score = score(map, scan, candidate.estimate.pose);
@@ -381,7 +382,7 @@ fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candid
                 pose,
                 covariance: spread,
             };
-            let estimate = refine(field, &scan.points, pose, &prior, &parameters.refinement);
+            let estimate = refine(field, &scan.points, pose, &prior, 0.0, &parameters.refinement);
             Candidate {
                 estimate,
                 score: score(map, scan, estimate.pose),

@@ -16,6 +16,9 @@ pub(crate) struct SlipWindow {
 struct Step {
     stamp: Stamp,
     seconds: f64,
+    /// By the wheels as they turned [m].
+    wheels: f64,
+    /// The same, less the slip that was expected [m], and the turn [rad].
     odometry: [f64; 2],
     posterior: [f64; 2],
 }
@@ -25,15 +28,18 @@ struct Step {
 pub(crate) struct Slip {
     /// (odometry's distance - the posterior's) / odometry's; positive when wheels spin, negative when they lock.
     pub(crate) ratio: f64,
+    /// The share of it that the slip learned so far does not explain.
+    pub(crate) unexplained: f64,
     /// Odometry's yaw rate less the posterior's [rad/s].
     pub(crate) yaw_rate: f64,
 }
 
 impl Slip {
-    /// What a motion by odometry over `seconds` was in truth, if the slip goes on as it was.
+    /// What a motion by odometry, less the slip expected, over `seconds` was in truth, if the rest of the slip goes on as
+    /// it was.
     pub(crate) fn corrected(self, motion: Pose, seconds: f64) -> Pose {
         // More than this is a pose that has jumped.
-        let (ratio, yaw_rate) = (self.ratio.clamp(-0.3, 0.3), self.yaw_rate.clamp(-2.0, 2.0));
+        let (ratio, yaw_rate) = (self.unexplained.clamp(-0.3, 0.3), self.yaw_rate.clamp(-2.0, 2.0));
         Pose::new(
             motion.x * (1.0 - ratio),
             motion.y * (1.0 - ratio),
@@ -49,11 +55,13 @@ const WINDOW: f64 = 0.3;
 const WALKING: f64 = 1.0;
 
 impl SlipWindow {
-    /// Adds one scan's motion, by odometry and by the posterior, each in the frame of its own start.
-    pub(crate) fn push(&mut self, stamp: Stamp, seconds: f64, odometry: Pose, posterior: Pose) {
+    /// Adds one scan's motion: by the wheels [m], by odometry less the slip expected, and by the posterior, each in the
+    /// frame of its own start.
+    pub(crate) fn push(&mut self, stamp: Stamp, seconds: f64, wheels: f64, odometry: Pose, posterior: Pose) {
         self.steps.push_back(Step {
             stamp,
             seconds,
+            wheels,
             odometry: [odometry.x, odometry.heading],
             posterior: [posterior.x, posterior.heading],
         });
@@ -73,15 +81,19 @@ impl SlipWindow {
         if seconds < WINDOW / 2.0 {
             return Slip::default();
         }
-        let driven = sum(|step| step.odometry[0]);
-        let ratio = if driven.abs() < WALKING * seconds {
-            0.0
-        } else {
-            (driven - sum(|step| step.posterior[0])) / driven
+        let posterior = sum(|step| step.posterior[0]);
+        let driven = sum(|step| step.wheels);
+        let share = |odometry: f64| {
+            if driven.abs() < WALKING * seconds {
+                0.0
+            } else {
+                ((odometry - posterior) / driven).clamp(-2.0, 2.0)
+            }
         };
         let yaw_rate = (sum(|step| step.odometry[1]) - sum(|step| step.posterior[1])) / seconds;
         Slip {
-            ratio: ratio.clamp(-2.0, 2.0),
+            ratio: share(driven),
+            unexplained: share(sum(|step| step.odometry[0])),
             yaw_rate,
         }
     }
@@ -96,25 +108,26 @@ impl SlipWindow {
 mod tests {
     use super::*;
 
-    fn slip(odometry: Pose, posterior: Pose) -> Slip {
+    fn slip(wheels: f64, odometry: Pose, posterior: Pose) -> Slip {
         let mut window = SlipWindow::default();
         for i in 0..20 {
-            window.push(Stamp(i * 25_000_000), 0.025, odometry, posterior);
+            window.push(Stamp(i * 25_000_000), 0.025, wheels, odometry, posterior);
         }
         window.slip()
     }
 
     #[test]
     fn spinning_wheels_are_positive_slip() {
-        let slip = slip(Pose::new(0.11, 0.0, 0.02), Pose::new(0.1, 0.0, 0.01));
+        let slip = slip(0.11, Pose::new(0.105, 0.0, 0.02), Pose::new(0.1, 0.0, 0.01));
         assert!((slip.ratio - 0.01 / 0.11).abs() < 1e-9);
+        assert!((slip.unexplained - 0.005 / 0.11).abs() < 1e-9);
         assert!((slip.yaw_rate - 0.4).abs() < 1e-9);
     }
 
     #[test]
     fn at_a_standstill_there_is_none() {
         assert!(
-            slip(Pose::new(0.001, 0.0, 0.0), Pose::new(-0.002, 0.0, 0.0))
+            slip(0.001, Pose::new(0.001, 0.0, 0.0), Pose::new(-0.002, 0.0, 0.0))
                 .ratio
                 .abs()
                 < 1e-12

@@ -24,7 +24,7 @@ fn lq() -> Parameters {
     let hq = Parameters::default();
     Parameters {
         motion: MotionParameters {
-            odometry_speed_error: 0.4,
+            odometry_speed_error: 0.2,
             odometry_side_error: 0.25,
             odometry_yaw_error: 1.0,
             diffusion_heading: 0.3,
@@ -61,6 +61,7 @@ fn baseline() -> Parameters {
     set.motion.alpha_4_tum = 0.1;
     set.motion.diffusion_xy = 0.0;
     set.motion.diffusion_heading = 0.0;
+    set.motion.learn_slip = false;
     set.sensor.sigma_hit = 0.1;
     set.sensor.squash_factor = 2.2;
     set.sensor.theta_discretization = 150;

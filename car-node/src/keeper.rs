@@ -593,4 +593,92 @@ mod tests {
             assert!(keeper.plan(&select("lq", Some(milliseconds)), None).is_err());
         }
     }
+
+    /// Numbers without an end, the same in every run.
+    struct Dice(u64);
+
+    impl Dice {
+        fn roll(&mut self, sides: usize) -> usize {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            (self.0 >> 33) as usize % sides
+        }
+
+        /// A command about sets, sensible or absurd: known and unknown keys with any value.
+        fn action(&mut self, keys: &[String]) -> ParamsAction {
+            let name = ["hq", "lq", "mine", "yours", "wet", "-"][self.roll(6)].to_owned();
+            let revert_after_ms = [None, Some(0), Some(500), Some(u32::MAX)][self.roll(4)];
+            match self.roll(8) {
+                0 => ParamsAction::Select {
+                    name,
+                    revert_after_ms,
+                },
+                1 => ParamsAction::Confirm,
+                2 => ParamsAction::Revert,
+                3 => ParamsAction::Delete { name },
+                4 => ParamsAction::Shadow { name: Some(name) },
+                _ => {
+                    let values =
+                        (0..self.roll(4)).map(|_| (keys[self.roll(keys.len())].clone(), self.value()));
+                    let values: BTreeMap<String, Value> = values.collect();
+                    ParamsAction::Put {
+                        set: ParameterSet {
+                            name,
+                            values: values.into_iter().collect(),
+                        },
+                        revert_after_ms,
+                    }
+                }
+            }
+        }
+
+        fn value(&mut self) -> Value {
+            match self.roll(9) {
+                0 => Value::Bool(true),
+                1 => Value::Int(i64::MAX),
+                2 => Value::Int(-1),
+                3 => Value::Int(1000),
+                4 => Value::Float(f64::NAN),
+                5 => Value::Float(1e300),
+                6 => Value::Float(0.25),
+                7 => Value::Float(-0.0),
+                _ => Value::Text("tum".into()),
+            }
+        }
+    }
+
+    /// Whatever is asked in whatever order: what is refused changes nothing, what is done counts up by one, and what is in
+    /// force is always a sound set.
+    #[test]
+    fn no_sequence_of_commands_leads_astray() {
+        let mut keys: Vec<String> = sets::values(&Parameters::default()).into_keys().collect();
+        keys.push("no_such_thing".into());
+        let mut dice = Dice(1);
+        let mut keeper = keeper();
+        let (mut done, mut refused) = (0, 0);
+        for _ in 0..3000 {
+            let action = dice.action(&keys);
+            let before = keeper.params();
+            let expected = [None, Some(before.revision), Some(before.revision + 1)][dice.roll(3)];
+            match keeper.plan(&action, expected) {
+                Err(refusal) => {
+                    refused += 1;
+                    let stale = expected.is_some_and(|expected| expected != before.revision);
+                    assert_eq!(matches!(refusal, Refusal::Stale { .. }), stale);
+                    assert_eq!(keeper.params(), before);
+                }
+                Ok(Decision::Change(plan)) => {
+                    done += 1;
+                    assert_eq!(keeper.params(), before);
+                    if plan.store {
+                        keeper.store(&plan, "anna");
+                    }
+                    keeper.commit(*plan, "anna", NOW, 7);
+                    assert_eq!(keeper.reference().revision, before.revision + 1);
+                }
+                Ok(_) => assert_eq!(keeper.reference().revision, before.revision),
+            }
+            assert!(keeper.in_force().parameters.validate().is_ok());
+        }
+        assert!(done > 200 && refused > 200, "{done} done, {refused} refused");
+    }
 }

@@ -435,3 +435,51 @@ fn a_nan_in_a_command_is_refused_by_its_field() {
         "synpf/v1/car-1/cmd/pose"
     );
 }
+
+/// How soon a switch is acknowledged, with three cars on one link. A measurement, so it runs on request:
+/// `cargo test --release -p system-tests --test commands -- --ignored --nocapture`
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "measures times, which depend on the machine and its load"]
+async fn acknowledgements_with_three_cars() {
+    const SWITCHES: usize = 200;
+    let endpoint = free_endpoint();
+    let folder = tempfile::tempdir().expect("a folder");
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let cars = ["car-1", "car-2", "car-3"].map(named);
+    let nodes: Vec<_> = cars
+        .iter()
+        .map(|car| start(car, &endpoint, Some(&folder.path().join(car.as_str()))))
+        .collect();
+    for car in &cars {
+        wait_until("the set in force is known", || known(&hub, car).is_some()).await;
+    }
+    let mut times = Vec::new();
+    for switch in 0..SWITCHES {
+        for car in &cars {
+            let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
+            let verdict = hub
+                .link()
+                .command(car, "ana", None, select(name))
+                .await
+                .expect("a good command");
+            let Verdict::Answered { after_s, .. } = verdict else {
+                panic!("{verdict:?}");
+            };
+            times.push(after_s * 1e3);
+        }
+    }
+    times.sort_by(f64::total_cmp);
+    let at = |share: f64| times[((times.len() - 1) as f64 * share) as usize];
+    let line = format!(
+        "{} switches of 3 cars acknowledged: p50 {:.1} ms, p99 {:.1} ms, max {:.1} ms\n",
+        times.len(),
+        at(0.5),
+        at(0.99),
+        at(1.0)
+    );
+    std::io::Write::write_all(&mut std::io::stdout(), line.as_bytes()).expect("stdout");
+    for node in nodes {
+        node.shutdown("measured");
+    }
+    hub.close().await;
+}

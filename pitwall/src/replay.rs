@@ -138,6 +138,10 @@ impl Replay {
             let at = self.span.0.saturating_add((at_s * 1e9) as i64);
             wheel.jump = Some(at.clamp(self.span.0, self.span.1));
         }
+        // Played on at its end, it begins again.
+        if playing == Some(true) && at_s.is_none() && wheel.at >= self.span.1 {
+            wheel.jump = Some(self.span.0);
+        }
         wheel.playing = playing.unwrap_or(wheel.playing);
         wheel.speed = speed.unwrap_or(wheel.speed);
         drop(wheel);

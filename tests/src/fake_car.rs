@@ -484,7 +484,10 @@ async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>
                 .payload()
                 .map(|p| p.to_bytes().into_owned())
                 .unwrap_or_default();
-            let (_, command) = decode::<Command>(&payload).expect("a command");
+            // As with a real car, what cannot be read is not obeyed.
+            let Ok((_, command)) = decode::<Command>(&payload) else {
+                return;
+            };
             let answer = obey(&mut state.lock().expect("no panic"), &command);
             respond(
                 &query,

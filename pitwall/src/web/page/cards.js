@@ -75,6 +75,10 @@ export const verdict = (shadow) => {
     `alignment ${fixed(c.shadow.alignment * 100, 0)} / ${fixed(c.force.alignment * 100, 0)} %, poses ${fixed(c.distance * 100, 1)} cm apart`;
 };
 
+/// Numbers change this often [ms]: nobody reads faster, and with twenty cars the browser has more to do than that.
+/// States and causes change at once.
+const READABLE = 190;
+
 /// Heights of a card [px]: whole, and with less on it.
 const WHOLE = 234, TIGHT = 190;
 
@@ -91,6 +95,8 @@ export class Cards {
     const whole = count * WHOLE <= room, tight = WHOLE + (count - 1) * TIGHT <= room || count <= 3;
     this.root.classList.toggle("tight", !whole && tight);
     this.root.classList.toggle("many", !whole && !tight);
+    const read = performance.now() - (this.read ?? 0) >= READABLE;
+    if (read) this.read = performance.now();
     cars.forEach((car, index) => {
       let card = this.cards.get(car.car);
       if (!card) {
@@ -100,7 +106,7 @@ export class Cards {
         this.root.insertBefore(card.root, next ?? null);
       }
       card.now = now;
-      card.update(car, index, car.car === selected);
+      card.update(car, index, car.car === selected, read);
     });
   }
 
@@ -185,21 +191,23 @@ class Card {
     return button;
   }
 
-  update(car, index, selected) {
+  update(car, index, selected, read) {
     this.car = car;
     const [shape, colour] = STATES[car.state] ?? ["?", "none"];
     const className = `card ${colour}${car.blind ? " blind" : ""}${selected ? " selected" : ""}`;
-    if (this.root.className !== className) this.root.className = className;
+    const changed = this.root.className !== className;
+    if (changed) this.root.className = className;
     if (this.index !== index) { this.index = index; this.chip.style.background = colourOf(index); }
     setText(this.state, `${shape} ${car.state}`);
-    setText(this.since, car.blind ? `silent for ${lasting(car.quiet_s)}` : lasting(car.state_for_s));
+    if (read || changed) setText(this.since, car.blind ? `silent for ${lasting(car.quiet_s)}` : lasting(car.state_for_s));
     const causes = car.causes.length > 1 ? `${car.causes[0]}; +${car.causes.length - 1}` : car.causes[0] ?? "";
-    setText(this.causes, causes);
-    if (this.causes.title !== car.causes.join("\n")) this.causes.title = car.causes.join("\n");
+    if (read || changed) setText(this.causes, causes);
+    if ((read || changed) && this.causes.title !== car.causes.join("\n")) this.causes.title = car.causes.join("\n");
+    if (!read && !changed) return;
     const hidden = this.root.parentElement?.classList.contains("many") && !selected;
     if (hidden) {
-      setText(this.brief, [car.set?.name ?? "–", fixed(car.health?.metrics && car.health.metrics.alignment * 100, 0, " %"),
-        fixed(car.pose && car.pose.age_s * 1e3, 0, " ms"), fixed(car.last_lap_s, 2, " s")].join(" · "));
+      setText(this.brief, [lasting(car.state_for_s), car.set?.name ?? "–", fixed(car.health?.metrics && car.health.metrics.alignment * 100, 0, " %"),
+        fixed(car.pose && car.pose.age_s * 1e3, 0, " ms")].join(" · "));
     } else {
       FACTS.forEach(([, text, off], i) => {
         setText(this.facts[i], text(car));

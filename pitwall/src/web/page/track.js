@@ -2,7 +2,8 @@
 
 import { STATES, colourOf, fixed } from "/cards.js";
 
-const TRAIL_S = 12;
+/// Length of a trail [s]; of those not selected, where there are many.
+const TRAIL_S = 12, SHORT_TRAIL_S = 3, MANY = 6;
 const END_POINTS = ["good", "quiet", "warn", "bad"];
 
 let colours = null;
@@ -301,12 +302,15 @@ export class Track {
   drawTrail(context, car, pixel, colour) {
     const trail = this.trails.get(car.car) ?? [];
     const now = this.snapshot.now / 1e9;
+    const whole = car.car === this.selected || this.snapshot.cars.length <= MANY;
+    const begin = whole ? 0 : trail.findIndex(([, , , at]) => at >= now - SHORT_TRAIL_S);
+    if (begin < 0) return;
     context.lineWidth = 3 * pixel;
     let style = "";
-    for (let i = 1; i < trail.length; i++) {
+    for (let i = begin + 1; i < trail.length; i++) {
       const [x0, y0] = trail[i - 1], [x1, y1, state, at] = trail[i];
       const jump = Math.hypot(x1 - x0, y1 - y0) > 2;
-      const fresh = Math.ceil(6 * (1 - (now - at) / TRAIL_S));
+      const fresh = Math.ceil(6 * (1 - (now - at) / (whole ? TRAIL_S : SHORT_TRAIL_S)));
       const next = `${state} ${fresh}`;
       if (next !== style || jump) {
         if (style) context.stroke();

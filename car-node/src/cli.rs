@@ -29,6 +29,10 @@ pub(crate) enum Command {
     ///
     /// Results go to stdout, progress to stderr. The same bag, set and seed give the same poses.
     Evaluate(Evaluate),
+    /// Say what each improvement over the reference brings: from synpf-baseline to a set, one row each.
+    ///
+    /// First each improvement on top of those before it, then the whole set without each.
+    Ablate(Ablate),
     /// Race simulated cars that drive on the filter's estimates, and hold the laps against the paper's.
     ///
     /// The same seed is the same race; only the load differs from run to run.
@@ -137,7 +141,7 @@ pub(crate) struct Evaluate {
     #[arg(long, value_name = "MAP.yaml")]
     pub(crate) map: PathBuf,
     /// ROS 2 bag (MCAP); may be repeated.
-    #[arg(long, value_name = "FILE.mcap", required = true)]
+    #[arg(long, value_name = "FILE.mcap", required = true, num_args = 1..)]
     pub(crate) bag: Vec<PathBuf>,
     /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
@@ -160,6 +164,33 @@ pub(crate) struct Evaluate {
     #[arg(long, value_name = "OUT.csv")]
     pub(crate) poses: Option<PathBuf>,
     /// One JSON object on stdout; an array of them for several bags or seeds.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// Arguments of `ablate`.
+#[derive(Debug, Args)]
+pub(crate) struct Ablate {
+    /// Map: a map_server YAML file.
+    #[arg(long, value_name = "MAP.yaml")]
+    pub(crate) map: PathBuf,
+    /// ROS 2 bag (MCAP); may be repeated.
+    #[arg(long, value_name = "FILE.mcap", required = true, num_args = 1..)]
+    pub(crate) bag: Vec<PathBuf>,
+    /// The set to arrive at: hq, lq, adaptive, or a YAML file.
+    #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
+    pub(crate) params: String,
+    /// Pose of base_link in the map at the first scan [m, m, rad], or `truth`. The reference cannot search a map, so
+    /// there must be one.
+    #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true, default_value = "truth")]
+    pub(crate) initial_pose: Start,
+    /// Seeds to take the mean over, as a list: 0,1,2.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0,1,2")]
+    pub(crate) seed: Vec<u64>,
+    /// Which topics of the bags to take.
+    #[command(flatten)]
+    pub(crate) topics: TopicArguments,
+    /// A JSON array of rows on stdout.
     #[arg(long)]
     pub(crate) json: bool,
 }

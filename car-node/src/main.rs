@@ -21,6 +21,7 @@ fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(arguments) => commands::run::run(&arguments),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
+        Command::Ablate(arguments) => commands::ablate::run(&arguments),
         Command::Race(arguments) => commands::race::run(&arguments),
         Command::Track(arguments) => commands::track::run(&arguments.command),
     };

@@ -22,7 +22,7 @@ use crate::cli::Evaluate;
 /// The range table of the map, as reported.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct RangeTable {
-    /// Time to make the map ready [ms].
+    /// Time to build it [ms].
     build_ms: f64,
     /// Memory that it takes.
     bytes: usize,
@@ -62,7 +62,6 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
             Ok((bag, log))
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
-    let before = Instant::now();
     let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
     // Only the part of the map that the car can get to from its start, where that is known: a whole building takes
     // a minute and a gigabyte.
@@ -74,6 +73,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
             .map(|(_, pose)| *pose),
         Some(Start::Global) | None => None,
     };
+    let before = Instant::now();
     map.prepare(start, &set.parameters);
     let range_table = RangeTable {
         build_ms: before.elapsed().as_secs_f64() * 1e3,

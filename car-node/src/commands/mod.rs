@@ -9,6 +9,7 @@ macro_rules! say {
     ($($line:tt)*) => { $crate::commands::say(&format!($($line)*)) };
 }
 
+pub(crate) mod ablate;
 pub(crate) mod evaluate;
 pub(crate) mod race;
 pub(crate) mod run;

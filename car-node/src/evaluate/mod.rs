@@ -1,6 +1,7 @@
 //! A filter over a whole log, as fast as it goes, held against the truth. Same inputs, same numbers (but for
 //! the times taken).
 
+pub mod ablation;
 mod errors;
 mod faults;
 mod states;

@@ -118,9 +118,9 @@ impl Parameters {
     }
 
     /// Reads a flat YAML file: our own keys, or those of the reference's `pf2_params.yaml` (bare, or under
-    /// `<node>: ros__parameters:`). Keys not given keep the value they have in `hq`; a file with the reference's
-    /// keys starts from `synpf-baseline` with its defects mended. Returns the set and the keys that mean nothing
-    /// here, for a warning. Faults are listed whole.
+    /// `<node>: ros__parameters:`). Keys not given keep the value they have in `hq`; a file that gives only
+    /// `max_particles` lowers `min_particles` with it. Returns the set and the keys that mean nothing here, for a
+    /// warning. Faults are listed whole.
     pub fn from_yaml(text: &str) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
         let file: Value = serde_saphyr::from_str(text).map_err(|e| {
             vec![ParameterFault {
@@ -135,7 +135,12 @@ impl Parameters {
                 fault,
             }]);
         };
-        let base = Self::named("hq").expect("hq ships");
+        let mut base = Self::named("hq").expect("hq ships");
+        if let Some(most) = given.get("max_particles").and_then(Value::as_u64)
+            && !given.contains_key("min_particles")
+        {
+            base.particles.min_particles = base.particles.min_particles.min(most as usize);
+        }
         base.with_values(
             given
                 .iter()

@@ -35,7 +35,7 @@ pub(super) fn parameter_table(file: &Value) -> Option<&Map<String, Value>> {
     )
 }
 
-/// A key and value of the reference in our terms; ours pass unchanged. A fixed number of particles stays fixed.
+/// A key and value of the reference in our terms; ours pass unchanged.
 pub(super) fn translate(key: &str, value: &Value) -> Vec<(String, Value)> {
     let name = RENAMED
         .iter()
@@ -73,8 +73,8 @@ mod tests {
 
     #[test]
     fn bare_keys_need_no_node() {
-        let (set, unknown) = Parameters::from_yaml("max_particles: 1234\n").expect("sound");
-        assert_eq!(set.particles.max_particles, 1234);
+        let (set, unknown) = Parameters::from_yaml("max_particles: 300\n").expect("sound");
+        assert_eq!((set.particles.max_particles, set.particles.min_particles), (300, 300));
         assert!(unknown.is_empty());
     }
 

@@ -74,7 +74,10 @@ mod tests {
     #[test]
     fn bare_keys_need_no_node() {
         let (set, unknown) = Parameters::from_yaml("max_particles: 300\n").expect("sound");
-        assert_eq!((set.particles.max_particles, set.particles.min_particles), (300, 300));
+        assert_eq!(
+            (set.particles.max_particles, set.particles.min_particles),
+            (300, 300)
+        );
         assert!(unknown.is_empty());
     }
 

@@ -8,7 +8,7 @@ use synpf::{ParameterFault, Parameters};
 
 /// Improvements in the order in which they are made, each with the keys that it changes. What a set changes beyond
 /// these comes last, so that the last row is always the set itself.
-const IMPROVEMENTS: [(&str, &[&str]); 13] = [
+const IMPROVEMENTS: [(&str, &[&str]); 15] = [
     ("turns keep their sign", &["defect_unsigned_rotation"]),
     ("translation noise has mean zero", &["defect_biased_translation"]),
     ("slow motion counts", &["defect_deadband"]),
@@ -54,6 +54,8 @@ const IMPROVEMENTS: [(&str, &[&str]); 13] = [
             "refine_feedback",
         ],
     ),
+    ("slip learned and taken out of odometry", &["learn_slip"]),
+    ("offset of the map's walls learned", &["wall_offset_distance"]),
     ("injection and search when in doubt", &["injection", "recover"]),
 ];
 

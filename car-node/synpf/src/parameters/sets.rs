@@ -67,6 +67,7 @@ fn baseline() -> Parameters {
     set.sensor.theta_discretization = 150;
     set.refinement = RefinementParameters {
         refine: false,
+        wall_offset_distance: 0.0,
         ..set.refinement
     };
     set.recovery.injection = false;

@@ -22,8 +22,24 @@ pub struct Browser {
 }
 
 impl Browser {
-    /// Opens `url` in a fresh browser whose page is `width` times `height` pixels large.
+    /// Opens `url` in a fresh browser whose page is `width` times `height` pixels large, and keeps a log of its console
+    /// and of every request.
     pub async fn open(url: &str, width: u32, height: u32) -> Self {
+        Self::start(
+            url,
+            width,
+            height,
+            json!({"browser": "ALL", "performance": "ALL"}),
+        )
+        .await
+    }
+
+    /// The same without a log: that of the network repeats every snapshot, which a measurement would measure.
+    pub async fn open_unwatched(url: &str, width: u32, height: u32) -> Self {
+        Self::start(url, width, height, json!({})).await
+    }
+
+    async fn start(url: &str, width: u32, height: u32, logs: Value) -> Self {
         let port = crate::free_endpoint()
             .rsplit_once(':')
             .map(|(_, port)| port.to_owned())
@@ -54,7 +70,7 @@ impl Browser {
         arguments.push(format!("--user-data-dir={}", profile.path().display()));
         let capabilities = json!({
             "goog:chromeOptions": {"args": arguments},
-            "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
+            "goog:loggingPrefs": logs,
         });
         let mut builder = ClientBuilder::new(HttpConnector::new());
         builder.capabilities(capabilities.as_object().cloned().expect("an object"));

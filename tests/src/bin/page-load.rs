@@ -74,7 +74,7 @@ async fn measure(options: &Options) -> anyhow::Result<()> {
         .with_context(|| format!("test-car, beside {}", me.display()))?;
     let cars = Running(cars);
     wait_for(&page)?;
-    let browser = Browser::open(&format!("http://{page}/"), 1366, 768).await;
+    let browser = Browser::open_unwatched(&format!("http://{page}/"), 1366, 768).await;
     let all = format!(
         "document.querySelectorAll('.card.good').length === {}",
         options.cars

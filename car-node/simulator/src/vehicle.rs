@@ -351,6 +351,22 @@ impl Vehicle {
         [s.vx, s.vy - self.params.rear_axle * s.yaw_rate, s.yaw_rate]
     }
 
+    /// Velocity of the centre of gravity in `map` [m/s].
+    pub fn velocity(&self) -> [f64; 2] {
+        let s = &self.state;
+        let (sin, cos) = s.heading.sin_cos();
+        [s.vx * cos - s.vy * sin, s.vx * sin + s.vy * cos]
+    }
+
+    /// Pushed from outside: moved by an offset [m], and its velocity changed [m/s], both in `map`.
+    pub(crate) fn push(&mut self, offset: [f64; 2], velocity: [f64; 2]) {
+        let s = &mut self.state;
+        let (sin, cos) = s.heading.sin_cos();
+        (s.x, s.y) = (s.x + offset[0], s.y + offset[1]);
+        s.vx += velocity[0] * cos + velocity[1] * sin;
+        s.vy += velocity[1] * cos - velocity[0] * sin;
+    }
+
     /// Lets `duration` [s] pass (rounded to whole steps of 1.25 ms, at least one).
     pub fn drive(&mut self, controls: Controls, duration: f64) {
         let steps = (duration / STEP).round().max(1.0) as usize;

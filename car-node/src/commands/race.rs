@@ -287,6 +287,7 @@ fn print_one(report: &Report) {
     line("alignment, ours", or_dash(s.alignment, 100.0, 2), "%");
     line("crashes", s.crashes.to_string(), "");
     line("scrapes", s.scrapes.to_string(), "");
+    line("collisions", s.collisions.to_string(), "");
     line("spins", s.spins.to_string(), "");
     line(
         "load",

@@ -48,6 +48,8 @@ pub struct CarResult {
     pub crashes: u32,
     /// Times it touched a wall and went on.
     pub scrapes: u32,
+    /// Times it touched another car.
+    pub collisions: u32,
     /// Times it turned round.
     pub spins: u32,
     /// Estimate against truth, at the scans' stamps, the first 2 s left out; None when nothing was estimated.
@@ -111,6 +113,8 @@ pub struct RaceSummary {
     pub crashes: u32,
     /// Scrapes of all cars.
     pub scrapes: u32,
+    /// Collisions of all cars; a pair that touches counts twice.
+    pub collisions: u32,
     /// Spins of all cars.
     pub spins: u32,
     /// Means over the cars.
@@ -144,6 +148,7 @@ impl RaceSummary {
             alignment: mean(&aligned),
             crashes: cars.iter().map(|car| car.crashes).sum(),
             scrapes: cars.iter().map(|car| car.scrapes).sum(),
+            collisions: cars.iter().map(|car| car.collisions).sum(),
             spins: cars.iter().map(|car| car.spins).sum(),
             load: LoadSummary {
                 cpu: load(|l| l.cpu),
@@ -162,7 +167,10 @@ pub(super) struct Recorder {
     finished: Vec<LapRecord>,
     pub(super) crashes: u32,
     pub(super) scrapes: u32,
+    pub(super) collisions: u32,
     pub(super) spins: u32,
+    /// Past the start line for the first time; the way there belongs to no lap.
+    pub(super) on_a_lap: bool,
     pose_errors: PoseErrors,
     /// Of the lap being driven: distances of estimate and car from the line, alignments.
     line_errors: Vec<f64>,
@@ -181,7 +189,9 @@ impl Recorder {
             finished: Vec::new(),
             crashes: 0,
             scrapes: 0,
+            collisions: 0,
             spins: 0,
+            on_a_lap: false,
             pose_errors: PoseErrors::default(),
             line_errors: Vec::new(),
             true_line_errors: Vec::new(),
@@ -215,6 +225,9 @@ impl Recorder {
 
     /// The driver was given `estimate`, and the car was `true_d` [m] from the line.
     pub(super) fn driven(&mut self, estimate: Pose, true_d: f64) {
+        if !self.on_a_lap {
+            return;
+        }
         let d = self.track.raceline.project([estimate.x, estimate.y]).d;
         self.line_errors.push(d.abs());
         self.true_line_errors.push(true_d.abs());
@@ -231,6 +244,9 @@ impl Recorder {
         base_link_from_laser: Pose,
     ) {
         self.pose_errors.push(scan.stamp, estimate, truth);
+        if !self.on_a_lap {
+            return;
+        }
         self.alignments_paper.push(paper_alignment(
             &self.map,
             scan,
@@ -262,6 +278,7 @@ impl Recorder {
             laps: self.finished,
             crashes: self.crashes,
             scrapes: self.scrapes,
+            collisions: self.collisions,
             spins: self.spins,
             pose_error: self.pose_errors.summaries(),
             alignment: mean(&self.alignments),

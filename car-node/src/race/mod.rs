@@ -180,6 +180,7 @@ impl Crew {
             Message::Odometry(odometry) => {
                 self.latest = Some(*odometry);
                 let pose = self.on_odometry(odometry, world, index)?;
+                self.recorder.on_a_lap = world.on_a_lap(index);
                 self.recorder.driven(pose, world.truth(index).track.d);
                 Some(Estimate {
                     time: odometry.stamp,
@@ -236,6 +237,10 @@ impl Crew {
             }
             Message::Scrape(_) => {
                 self.recorder.scrapes += 1;
+                None
+            }
+            Message::Collision(_) => {
+                self.recorder.collisions += 1;
                 None
             }
             Message::Spin => {

@@ -211,6 +211,7 @@ fn feed(race: &Race, output: Output) -> Option<Feed> {
         }),
         Message::Crash(crash) => Feed::Word(format!("crash at {:.1} m/s", crash.impact)),
         Message::Scrape(crash) => Feed::Word(format!("scraped a wall at {:.1} m/s", crash.impact)),
+        Message::Collision(crash) => Feed::Word(format!("touched another car at {:.1} m/s", crash.impact)),
         Message::Spin => Feed::Word("spin".into()),
         Message::Placed(pose) => Feed::Placed(pose),
         Message::Lap(_) => return None,

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! The filter hands on a scan when its own update is done and on its way, and never waits for the shadow: a full queue
-//! costs the shadow a scan. The shadow ends by itself when there is not enough CPU for both ([`budget`]), and when it
+//! costs the shadow a scan. The shadow ends by itself when there is not enough CPU for both (see `budget`), and when it
 //! has lost its pose: to search the map would take all cores.
 
 mod budget;

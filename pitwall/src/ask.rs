@@ -3,7 +3,7 @@
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::{
     Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Key,
@@ -17,6 +17,10 @@ use crate::link::{ASK_CONGESTION, ASK_PRIORITY, Link, unix_now};
 
 /// How long a car may take to answer.
 pub const PATIENCE: Duration = Duration::from_secs(2);
+/// A command that is not answered for so long is sent again: the radio may have lost it, or its answer.
+const REPEAT: Duration = Duration::from_millis(500);
+/// Between two attempts that end at once, as they do while a car restarts.
+const BREATH: Duration = Duration::from_millis(50);
 
 /// What became of a command, as the operator sees it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -31,11 +35,13 @@ pub enum Verdict {
     },
     /// No car of that name is there. Nothing has changed.
     NoSuchCar,
-    /// The car is there and has not answered in time. It may have done it or not: look at the set in force, or
+    /// The car was there and has not answered in time. It may have done it or not: look at the set in force, or
     /// send the same command again, which is harmless.
     NoAnswer {
         /// How long was waited [s].
         waited_s: f64,
+        /// The car has left the link meanwhile.
+        gone: bool,
     },
     /// Something answered that cannot be read. It may have been done or not.
     Unreadable {
@@ -84,10 +90,14 @@ impl Verdict {
             Self::NoSuchCar => format!(
                 "{car}: NO SUCH CAR on this link, nothing has changed. `pitwall cars` lists those there are"
             ),
-            Self::NoAnswer { waited_s } => format!(
-                "{car}: NO ANSWER within {waited_s:.1} s; it may or may not have been done. See `pitwall params {car}`, \
-                 or give the command again: that is harmless"
-            ),
+            Self::NoAnswer { waited_s, gone } => {
+                let when = if *gone { " when it is back" } else { "" };
+                let gone = if *gone { " and has left the link" } else { "" };
+                format!(
+                    "{car}: NO ANSWER within {waited_s:.1} s{gone}; it may or may not have been done. See \
+                     `pitwall params {car}`{when}, or give the command again: that is harmless"
+                )
+            }
             Self::Unreadable { error } => format!(
                 "{car}: the ANSWER CANNOT BE READ ({error}); it may or may not have been done. Are car and pit wall \
                  of the same version?"
@@ -121,29 +131,49 @@ impl Link {
         self.send(car, &command, PATIENCE).await
     }
 
-    /// Sends a command, possibly not for the first time.
+    /// Sends a command, possibly not for the first time, and again until it is answered or `patience` is over. The
+    /// car does it once, whatever the number of copies that arrive.
     pub async fn send(
         &self,
         car: &CarName,
         command: &Command,
         patience: Duration,
     ) -> Result<Verdict, CodecError> {
-        let begun = std::time::Instant::now();
+        let begun = Instant::now();
         let bytes = encode(command, stamps())?;
-        let answer = self
-            .ask::<Answer>(car, command.action.topic(), bytes, patience)
-            .await;
-        let after_s = begun.elapsed().as_secs_f64();
-        Ok(match answer {
-            Ok(Some(answer)) if answer.id == command.id => Verdict::Answered { answer, after_s },
-            Ok(Some(answer)) => Verdict::Unreadable {
-                error: format!("it answers command {} instead of {}", answer.id, command.id),
-            },
-            // Without a car nothing replies, and zenoh says so at once and without an error.
-            Ok(None) if self.alive(car).await => Verdict::NoAnswer { waited_s: after_s },
-            Ok(None) => Verdict::NoSuchCar,
-            Err(error) => Verdict::Unreadable { error },
-        })
+        let mut was_there = false;
+        loop {
+            let left = patience.saturating_sub(begun.elapsed());
+            let (there, answer) = tokio::join!(
+                self.alive(car),
+                self.ask::<Answer>(car, command.action.topic(), bytes.clone(), left.min(REPEAT))
+            );
+            let waited_s = begun.elapsed().as_secs_f64();
+            match answer {
+                Ok(Some(answer)) if answer.id == command.id => {
+                    return Ok(Verdict::Answered {
+                        answer,
+                        after_s: waited_s,
+                    });
+                }
+                Ok(Some(answer)) => {
+                    return Ok(Verdict::Unreadable {
+                        error: format!("it answers command {} instead of {}", answer.id, command.id),
+                    });
+                }
+                Err(error) => return Ok(Verdict::Unreadable { error }),
+                // It never was there to take the command in.
+                Ok(None) if !there && !was_there => return Ok(Verdict::NoSuchCar),
+                Ok(None) if begun.elapsed() >= patience => {
+                    return Ok(Verdict::NoAnswer {
+                        waited_s,
+                        gone: !there,
+                    });
+                }
+                Ok(None) => was_there = true,
+            }
+            tokio::time::sleep(BREATH).await;
+        }
     }
 
     /// True when the car's node runs.

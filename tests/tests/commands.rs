@@ -80,9 +80,16 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
     let mut switched_at = Vec::new();
     for switch in 0..SWITCHES {
         let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
+        let command = Command {
+            id: new_command_id(),
+            operator: "ana".into(),
+            expected_revision: expected,
+            action: select(name),
+        };
+        // A machine that stands still for a while is not what this looks for.
         let verdict = hub
             .link()
-            .command(&car, "ana", expected, select(name))
+            .send(&car, &command, system_tests::DEADLINE)
             .await
             .expect("a good command");
         let Verdict::Answered { answer, .. } = &verdict else {

@@ -3,14 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use car_node::bag::SensorLog;
 use car_node::evaluate::ablation::{Change, Step, steps};
 use car_node::evaluate::{Outcome, Start, Summaries, Truth, mean, run as run_over};
+use car_node::frames::Mount;
 use indicatif::{ProgressBar, ProgressStyle};
 use maps::OccupancyGrid;
 use serde::Serialize;
-use synpf::{Localizer, TrackMap};
+use synpf::{Localizer, SetUpError, TrackMap};
 
 use crate::cli::Ablate;
 
@@ -67,18 +68,9 @@ impl Row {
 
 pub(crate) fn run(arguments: &Ablate) -> anyhow::Result<()> {
     let set = super::load_set(&arguments.params)?;
-    let steps = match steps(&set.parameters) {
-        Ok(steps) => steps,
-        Err(faults) => bail!(
-            "{}: no way there from synpf-baseline: {}",
-            set.name,
-            faults
-                .iter()
-                .map(ToString::to_string)
-                .collect::<Vec<_>>()
-                .join("; ")
-        ),
-    };
+    let steps = steps(&set.parameters)
+        .map_err(SetUpError::Parameters)
+        .with_context(|| format!("{}: no way there from synpf-baseline", set.name))?;
     let grid = OccupancyGrid::load(&arguments.map)?;
     let logs = arguments
         .bag
@@ -94,13 +86,14 @@ pub(crate) fn run(arguments: &Ablate) -> anyhow::Result<()> {
     let mut rows = Vec::new();
     for (bag, log) in &logs {
         let truth = Truth::new(log.truth.clone());
+        let mount = super::mount(bag, log);
         for step in &steps {
             progress.set_message(step.name.clone());
             let outcomes = arguments
                 .seed
                 .iter()
                 .map(|&seed| {
-                    let outcome = over(&map, bag, log, &truth, step, arguments.initial_pose, seed);
+                    let outcome = over(&map, log, mount, &truth, step, arguments.initial_pose, seed);
                     progress.inc(1);
                     outcome
                 })
@@ -123,14 +116,13 @@ pub(crate) fn run(arguments: &Ablate) -> anyhow::Result<()> {
 
 fn over(
     map: &Arc<TrackMap>,
-    bag: &Path,
     log: &SensorLog,
+    mount: Mount,
     truth: &Truth,
     step: &Step,
     start: Start,
     seed: u64,
 ) -> anyhow::Result<Outcome> {
-    let mount = super::mount(bag, log);
     let parameters = step.parameters.clone();
     let mut localizer = Localizer::new(Arc::clone(map), mount.base_link_from_laser, parameters, seed)?;
     Ok(run_over(&mut localizer, &log.arrivals, truth, start, |_, _| {})?)

@@ -11,7 +11,6 @@ use car_node::bag::SensorLog;
 use car_node::evaluate::{
     ErrorSummary, Fault, FaultKind, FaultReport, Outcome, Start, Truth, run as run_over,
 };
-use car_node::sets::NamedSet;
 use indicatif::{ProgressBar, ProgressStyle};
 use maps::OccupancyGrid;
 use serde::Serialize;
@@ -83,8 +82,16 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     let mut reports = Vec::new();
     for (bag, log) in &logs {
         let truth = Truth::new(log.truth.clone());
+        let mount = super::mount(bag, log);
         for &seed in &arguments.seed {
-            let outcome = over_bag(arguments, &map, &set, bag, log, &truth, seed)
+            let localizer = Localizer::new(
+                Arc::clone(&map),
+                mount.base_link_from_laser,
+                set.parameters.clone(),
+                seed,
+            )?;
+            let progress = progress_bar(bag, seed);
+            let outcome = over_bag(arguments, localizer, log, &truth, &progress)
                 .with_context(|| bag.display().to_string())?;
             reports.push(Report {
                 bag: (*bag).clone(),
@@ -134,23 +141,13 @@ fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
 
 fn over_bag(
     arguments: &Evaluate,
-    map: &Arc<TrackMap>,
-    set: &NamedSet,
-    bag: &Path,
+    mut localizer: Localizer,
     log: &SensorLog,
     truth: &Truth,
-    seed: u64,
+    progress: &ProgressBar,
 ) -> anyhow::Result<Outcome> {
-    let mount = super::mount(bag, log);
-    let mut localizer = Localizer::new(
-        Arc::clone(map),
-        mount.base_link_from_laser,
-        set.parameters.clone(),
-        seed,
-    )?;
     let mut poses = arguments.poses.as_deref().map(PoseFile::create).transpose()?;
     let mut failed = None;
-    let progress = progress_bar(bag, seed);
     let start = arguments.initial_pose.unwrap_or(Start::Global);
     let outcome = run_over(&mut localizer, &log.arrivals, truth, start, |update, done| {
         if update.number.is_multiple_of(64) {

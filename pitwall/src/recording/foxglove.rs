@@ -3,7 +3,7 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
 use protocol::{
-    CarName, Cell, Cloud, Event, EventKind, Header, MapReply, Pose, Pose2, ScanView, Severity, Telemetry,
+    CarName, Cloud, Event, EventKind, Header, MapReply, Pose, Pose2, ScanView, Severity, Telemetry,
 };
 use serde_json::{Value, json};
 
@@ -64,14 +64,7 @@ pub(super) fn export(car: &CarName, header: &Header, telemetry: &Telemetry) -> V
 
 /// The map as other tools get to see it.
 pub(super) fn export_map(map: &MapReply, at: i64) -> Exported {
-    let data: Vec<u8> = map
-        .cells()
-        .map(|cell| match cell {
-            Cell::Free => 0,
-            Cell::Occupied => 100,
-            Cell::Unknown => 255,
-        })
-        .collect();
+    let data = map.occupancy();
     Exported {
         channel: "map",
         schema: "foxglove.Grid",

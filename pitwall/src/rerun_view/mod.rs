@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crossbeam_channel::Receiver;
-use protocol::{CarName, Cell, Cloud, Health, MapReply, Params, Pose, ScanView, Severity, Telemetry, Topic};
+use protocol::{CarName, Cloud, Health, MapReply, Params, Pose, ScanView, Severity, Telemetry, Topic};
 use rerun::blueprint::{Blueprint, ContainerLike, Horizontal, Spatial3DView};
 use rerun::blueprint::{StateTimelineView, TextLogView, TimeSeriesView, Vertical};
 use rerun::grpc_server::GrpcServerSink;
@@ -313,14 +313,7 @@ impl EventLog {
 
 /// The grid; its first row is its lowest, an image's its highest.
 fn grid(map: &MapReply) -> GridMap {
-    let cells: Vec<u8> = map
-        .cells()
-        .map(|cell| match cell {
-            Cell::Free => 0,
-            Cell::Occupied => 100,
-            Cell::Unknown => 255,
-        })
-        .collect();
+    let cells = map.occupancy();
     let rows: Vec<_> = cells.chunks(map.width.max(1) as usize).rev().collect();
     let format = rerun::components::ImageFormat::from_color_model(
         [map.width, map.height],

@@ -86,6 +86,17 @@ impl MapReply {
             .iter()
             .flat_map(|&(cell, length)| std::iter::repeat_n(cell, length as usize))
     }
+
+    /// The cells as ROS gives them (`nav_msgs/OccupancyGrid`): 0 free, 100 occupied, 255 unknown.
+    pub fn occupancy(&self) -> Vec<u8> {
+        self.cells()
+            .map(|cell| match cell {
+                Cell::Free => 0,
+                Cell::Occupied => 100,
+                Cell::Unknown => 255,
+            })
+            .collect()
+    }
 }
 
 impl Message for MapReply {

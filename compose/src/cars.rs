@@ -1,4 +1,4 @@
-//! The cars of the demo: of different grip, one behind another, and what happens to them.
+//! The cars of the demo: of different grip, one behind another, one with an opponent ahead, and what happens to them.
 
 use std::sync::Arc;
 use std::thread;
@@ -8,7 +8,7 @@ use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::sets;
 use car_node::source::{Incident, Race, ScriptedIncident};
 use protocol::CarName;
-use simulator::{CarSetup, Grip, OdometryParams, Track, YawSource};
+use simulator::{CarSetup, DriverParams, Grip, Guidance, OdometryParams, Track, YawSource};
 use synpf::TrackMap;
 
 use crate::Options;
@@ -16,8 +16,15 @@ use crate::Options;
 /// From one car to the next on the grid [m]: near enough for the one behind to have the other in view.
 const GAP: f64 = 4.0;
 
-/// Starts every car.
-pub(crate) fn start(options: &Options) -> anyhow::Result<Vec<Node>> {
+/// What happens repeats after this long.
+pub(crate) const ROUND: Duration = Duration::from_mins(2);
+/// When car 1 drives onto dust, and when it is off it again.
+pub(crate) const DUST: [Duration; 2] = [Duration::from_secs(30), Duration::from_mins(1)];
+/// When the last car is knocked round.
+pub(crate) const KNOCK: Duration = Duration::from_secs(80);
+
+/// Starts every car; the last one reaches the wall by `radio`.
+pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>> {
     let track = Track::find(&options.track)?;
     let map = RaceMap {
         name: track.name.clone(),
@@ -25,7 +32,19 @@ pub(crate) fn start(options: &Options) -> anyhow::Result<Vec<Node>> {
         raceline: Some(Arc::new(track.raceline.clone())),
     };
     let count = usize::from(options.cars);
-    let setups: Vec<CarSetup> = (0..count).map(setup).collect();
+    let mut setups: Vec<CarSetup> = (0..count).map(setup).collect();
+    // The last car starts behind an opponent, which nobody at the wall knows.
+    let last = setups.last_mut().expect("one car at least");
+    let opponent = CarSetup {
+        guidance: Guidance::Truth,
+        driver: DriverParams {
+            speed_scale: 0.97,
+            ..last.driver
+        },
+        ..*last
+    };
+    last.start -= GAP;
+    setups.push(opponent);
     let race = Race::new(track, setups, options.seed, script(count));
     (0..count)
         .map(|index| {
@@ -34,7 +53,8 @@ pub(crate) fn start(options: &Options) -> anyhow::Result<Vec<Node>> {
             config.set = Some(sets::load(&options.params)?);
             config.begin = Begin::Source;
             config.seed = options.seed.wrapping_add(index as u64);
-            config.connect = vec![options.listen.clone()];
+            let last = index + 1 == count;
+            config.connect = vec![if last { radio } else { &options.listen }.to_owned()];
             Ok(Node::start(config)?)
         })
         .collect()
@@ -69,17 +89,19 @@ fn setup(index: usize) -> CarSetup {
     setup
 }
 
-/// What happens: every two minutes car 1 drives onto dust for half a minute, and the last car is knocked round.
+/// What happens to the cars. The radio has a plan of its own.
 fn script(cars: usize) -> Vec<ScriptedIncident> {
-    let rounds: u64 = 60;
-    (0..rounds)
+    (0..60)
         .flat_map(|round| {
-            let at = |seconds: u64| Duration::from_secs(round * 120 + seconds);
-            let incident = |at, car, incident| ScriptedIncident { at, car, incident };
+            let incident = |at, car, incident| ScriptedIncident {
+                at: ROUND * round + at,
+                car,
+                incident,
+            };
             [
-                incident(at(30), 0, Incident::Grip(Grip::LQ)),
-                incident(at(60), 0, Incident::Grip(Grip::HQ)),
-                incident(at(80), cars - 1, Incident::Knock(9.0)),
+                incident(DUST[0], 0, Incident::Grip(Grip::LQ)),
+                incident(DUST[1], 0, Incident::Grip(Grip::HQ)),
+                incident(KNOCK, cars - 1, Incident::Knock(9.0)),
             ]
         })
         .collect()

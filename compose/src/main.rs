@@ -2,6 +2,7 @@
 //! internet.
 
 mod cars;
+mod radio;
 mod show;
 
 use std::net::SocketAddr;
@@ -78,10 +79,15 @@ fn run(options: &Options) -> anyhow::Result<()> {
         .context(
             "if another pit wall runs here, give --listen tcp/127.0.0.1:PORT and --page 127.0.0.1:PORT",
         )?;
-    let nodes = cars::start(options)?;
-    show::banner(options, wall.url());
-    let shown = runtime.block_on(show::until_the_end(wall.hub(), options.time, options.json));
+    let radio = runtime.block_on(radio::start(&options.listen))?;
+    let nodes = cars::start(options, &radio)?;
+    let shown = show::banner(options, wall.url())
+        .and_then(|()| runtime.block_on(show::until_the_end(wall.hub(), options.time, options.json)));
     cars::shutdown(nodes);
     runtime.block_on(wall.stop());
-    shown
+    // Nobody reads on: the demo ends quietly.
+    match shown {
+        Err(error) if show::is_closed_pipe(&error) => Ok(()),
+        shown => shown,
+    }
 }

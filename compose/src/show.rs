@@ -1,28 +1,69 @@
 //! What the demo prints.
-#![allow(
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "this is the program's output"
-)]
+#![allow(clippy::print_stderr, reason = "this is the program's output")]
 
+use std::io::{self, ErrorKind, Write};
 use std::time::Duration;
 
 use pitwall::{CarView, Hub, unix_now};
 use protocol::Severity;
 
 use crate::Options;
+use crate::{cars, radio};
 
 /// How often the cars are listed.
 const LIST: Duration = Duration::from_secs(10);
 /// How often news and JSON are written.
 const TICK: Duration = Duration::from_secs(1);
 
+/// Writes a line to stdout.
+fn say(line: &str) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "{line}")?;
+    out.flush()
+}
+
+/// Whether the demo ended because nobody reads what it prints, as after `| head`.
+pub(crate) fn is_closed_pipe(error: &anyhow::Error) -> bool {
+    error
+        .downcast_ref::<io::Error>()
+        .is_some_and(|error| error.kind() == ErrorKind::BrokenPipe)
+}
+
 /// Says what to look at.
-pub(crate) fn banner(options: &Options, url: &str) {
+pub(crate) fn banner(options: &Options, url: &str) -> anyhow::Result<()> {
     if options.json {
-        return;
+        return Ok(());
     }
-    println!(
+    let last = options.cars;
+    let clock = |time: Duration| format!("{}:{:02}", time.as_secs() / 60, time.as_secs() % 60);
+    let events = [
+        (
+            cars::DUST[0],
+            "car-1 drives onto dust: slip and the distance to its line grow, the pose stays good".to_owned(),
+        ),
+        (cars::DUST[1], "car-1 is off the dust again".to_owned()),
+        (
+            cars::KNOCK,
+            format!("car-{last} is knocked round: it turns, and is localized on"),
+        ),
+        (
+            radio::SILENT[0],
+            format!("car-{last}'s radio falls silent: BLIND at the wall, then its gaps fill"),
+        ),
+        (
+            radio::SILENT[0] + radio::SILENT[1],
+            format!("car-{last}'s radio is back"),
+        ),
+    ];
+    let taped = if options.cars > 1 {
+        "car-2 has taped tyres: it slips all the time. "
+    } else {
+        ""
+    };
+    let events = events
+        .map(|(at, what)| format!("  {}  {what}", clock(at)))
+        .join("\n");
+    say(&format!(
         "{} cars race on {}; the pit wall listens at {}.
 
 Open the page:  {url}
@@ -34,11 +75,17 @@ Or look at it from another terminal:
   pitwall record -o race.mcap --for 30s
 (cargo run --release -p pitwall -- cars, and so on.)
 
-At 0:30 of every two minutes car-1 loses its grip for half a minute; at 1:20 the last car is knocked round.
+{taped}An opponent drives ahead of car-{last}, and stands in its scans.
+What happens, in every round of {}:
+{events}
 Ctrl-C ends the demo.
 ",
-        options.cars, options.track, options.listen
-    );
+        options.cars,
+        options.track,
+        options.listen,
+        clock(cars::ROUND),
+    ))?;
+    Ok(())
 }
 
 /// Says why the demo failed.
@@ -73,7 +120,7 @@ async fn show(hub: &Hub, json: bool) -> anyhow::Result<()> {
             (fleet.view(unix_now()), news)
         };
         if json {
-            println!("{}", serde_json::to_string(&cars)?);
+            say(&serde_json::to_string(&cars)?)?;
             continue;
         }
         for entry in news {
@@ -84,11 +131,11 @@ async fn show(hub: &Hub, json: bool) -> anyhow::Result<()> {
             };
             let car = entry.car.map_or_else(String::new, |car| car.to_string());
             let who = entry.who.map_or_else(String::new, |who| format!(" ({who})"));
-            println!("{mark} {car:<8} {}{who}", entry.text);
+            say(&format!("{mark} {car:<8} {}{who}", entry.text))?;
         }
         if tokio::time::Instant::now() >= list_due {
             list_due += LIST;
-            println!("{}", list(&cars));
+            say(&list(&cars))?;
         }
     }
 }

@@ -139,7 +139,7 @@ fn a_kidnapped_car_says_lost_at_once_and_finds_itself_again() {
 }
 
 #[test]
-fn silent_sensors_are_stale_and_no_loss() {
+fn silent_sensors_are_stale_and_no_false_loss() {
     let sound = sound();
     for fault in ["no-scans@8+1.5", "no-odometry@8+1.5"] {
         let fault: Fault = fault.parse().expect("a fault");
@@ -152,7 +152,13 @@ fn silent_sensors_are_stale_and_no_loss() {
             "{report:?} {:?}",
             outcome.state_changes
         );
-        assert_eq!(report.lost_after_s, None, "{:?}", outcome.state_changes);
+        // A second and a half without odometry may cost the pose; then, and only then, the car is lost.
+        assert_eq!(
+            outcome.state_truth.expect("truth").false_lost,
+            0,
+            "{:?}",
+            outcome.state_changes
+        );
         assert!(report.localized_after_s.is_some(), "{report:?}");
     }
 }
@@ -245,7 +251,8 @@ fn a_car_that_was_put_in_wrongly_ends_localized_where_it_is() {
         outcome.errors.expect("truth"),
         outcome.state_truth.expect("truth"),
     );
-    assert!(errors.position_error_m.max < 0.2, "{errors:?}");
+    // Two seconds in it may still be on its way there.
+    assert!(errors.position_error_m.p95 < 0.1, "{errors:?}");
     assert!(truth.precision > Some(0.97), "{truth:?}");
     assert!(last.at_s < 5.0, "{:?}", outcome.state_changes);
 }

@@ -573,7 +573,9 @@ impl Localizer {
             }
             self.settled = self.settled.saturating_add(1);
             let recovery = &self.parameters.recovery;
-            self.w_ratio = self.doubt.push(quality.clear_alignment().max(0.02), recovery);
+            self.w_ratio = self
+                .doubt
+                .push(quality.clear_alignment().max(0.02), quality.alignment, recovery);
             let lost = self.settled > 10
                 && self.doubt.lost(
                     quality.clear_alignment(),

@@ -71,7 +71,7 @@ impl RecoveryParameters {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Doubt {
     averages: Option<[f64; 2]>,
-    /// The short-term average at the last scans, the newest first.
+    /// The alignment of the last scans, whatever stands in view, averaged over the short term, the newest first.
     recent: [f64; SUDDEN_SCANS],
     /// For how much longer the last sudden fall counts [s].
     sudden_for: f64,
@@ -104,17 +104,18 @@ const MOST_PATIENCE: f64 = 4.0;
 impl Doubt {
     /// Takes in the likelihood of a scan, any positive measure whose ratio means something. Returns
     /// `w_fast` / `w_slow`.
-    pub(crate) fn push(&mut self, likelihood: f64, parameters: &RecoveryParameters) -> f64 {
+    pub(crate) fn push(&mut self, likelihood: f64, alignment: f64, parameters: &RecoveryParameters) -> f64 {
         let [slow, fast] = self.averages.unwrap_or([USUAL; 2]);
         let slow = slow + parameters.alpha_slow * (likelihood - slow);
         let fast = fast + parameters.alpha_fast * (likelihood - fast);
         if self.averages.is_none() {
-            self.recent = [fast; SUDDEN_SCANS];
+            self.recent = [USUAL; SUDDEN_SCANS];
         }
+        let now = self.recent[0] + parameters.alpha_fast * (alignment - self.recent[0]);
         self.recent.rotate_right(1);
-        self.recent[0] = fast;
+        self.recent[0] = now;
         let highest = self.recent.into_iter().fold(0.0, f64::max);
-        if highest - fast > SUDDEN_FALL * slow {
+        if highest - now > SUDDEN_FALL * slow {
             self.sudden_for = SUDDEN_FOR;
         }
         self.averages = Some([slow, fast]);
@@ -144,7 +145,8 @@ impl Doubt {
         self.wrong_for > parameters.lost_after - 1e-3
     }
 
-    /// True when the scan has fitted worse than before for long enough to ask whether another place fits better.
+    /// True when the scan has fitted worse than before for long enough, or suddenly worse, to ask whether another place
+    /// fits better.
     /// `ratio` is `w_fast / w_slow`. An opponent in view looks the same at first; the comparison tells them apart.
     pub(crate) fn asks(
         &mut self,
@@ -156,7 +158,7 @@ impl Doubt {
         let [wait, next] = self.patience;
         self.sudden_for = (self.sudden_for - seconds).max(0.0);
         self.patience[0] = (wait - seconds).max(0.0);
-        if ratio > parameters.doubt_ratio || alignment > 0.85 {
+        if (ratio > parameters.doubt_ratio && !self.sudden()) || alignment > 0.85 {
             self.doubted_for = 0.0;
             if ratio > 0.95 {
                 self.patience[1] = 0.0;
@@ -192,15 +194,15 @@ mod tests {
         let parameters = RecoveryParameters::default();
         let mut doubt = Doubt::default();
         for _ in 0..200 {
-            assert!((0.99..1.15).contains(&doubt.push(0.9, &parameters)));
+            assert!((0.99..1.15).contains(&doubt.push(0.9, 0.9, &parameters)));
         }
         let mut ratio = 1.0;
         for _ in 0..10 {
-            ratio = doubt.push(0.2, &parameters);
+            ratio = doubt.push(0.2, 0.2, &parameters);
         }
         assert!(ratio < 0.4, "{ratio}");
         for _ in 0..2000 {
-            ratio = doubt.push(0.2, &parameters);
+            ratio = doubt.push(0.2, 0.2, &parameters);
         }
         assert!(ratio > 0.95, "{ratio}");
     }
@@ -212,13 +214,11 @@ mod tests {
         let falls = |scans: i32| {
             let mut doubt = Doubt::default();
             for _ in 0..200 {
-                doubt.push(0.9, &parameters);
+                doubt.push(0.9, 0.9, &parameters);
             }
             (0..=scans + 3).any(|scan| {
-                doubt.push(
-                    0.9 - 0.4 * f64::from(scan.min(scans)) / f64::from(scans),
-                    &parameters,
-                );
+                let fit = 0.9 - 0.4 * f64::from(scan.min(scans)) / f64::from(scans);
+                doubt.push(fit, fit, &parameters);
                 doubt.sudden()
             })
         };

@@ -21,7 +21,8 @@ pub struct RefinementParameters {
     pub refine_beams: usize,
     /// Most Gauss-Newton steps.
     pub refine_iterations: usize,
-    /// Standard deviation of an end point's distance to its wall [m]: laser and map together.
+    /// Standard deviation of an end point's distance to its wall [m]: laser, and the grain of a map of 5 cm cells. Smaller
+    /// values follow every dent of the map and hear little of odometry; on real maps they fit worse.
     pub refine_sigma: f64,
     /// Distance from a wall at which an end point counts a quarter [m]; farther ones are opponents.
     pub refine_reach: f64,
@@ -40,8 +41,8 @@ impl Default for RefinementParameters {
             refine: true,
             refine_beams: 540,
             refine_iterations: 8,
-            refine_sigma: 0.02,
-            refine_reach: 0.06,
+            refine_sigma: 0.05,
+            refine_reach: 0.1,
             refine_correlation: 4.0,
             refine_feedback: 0.1,
             wall_offset_distance: 3.0,

@@ -13,9 +13,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use common::{BASE_LINK_FROM_LASER, odometry, ring, scan, truth};
-use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use criterion::{BatchSize, BenchmarkId, Criterion, criterion_group, criterion_main};
 use maps::DistanceField;
-use synpf::{Localizer, Parameters, Scan, TrackMap};
+use synpf::{Localizer, Parameters, Scan, Stage, TrackMap};
 
 /// A localizer with a drive that never ends, one update per call.
 struct Drive {
@@ -87,6 +87,32 @@ fn whole_update(criterion: &mut Criterion) {
     group.finish();
 }
 
+/// What each stage costs: particles and beams swept where the stage depends on them.
+fn stages(criterion: &mut Criterion) {
+    let map = ring();
+    let mut group = criterion.benchmark_group("stage");
+    group.sample_size(50);
+    for (particles, beams) in [(500, 21), (1500, 21), (3000, 21), (3000, 61)] {
+        let mut set = Parameters::named("hq").expect("ships");
+        set.particles.max_particles = particles;
+        set.particles.min_particles = particles;
+        set.beams.beams = beams;
+        let drive = Drive::new(&map, set);
+        let scan = &drive.scans[drive.step % drive.scans.len()];
+        for stage in Stage::ALL {
+            let id = BenchmarkId::new(format!("{stage:?}"), format!("{particles} x {beams}"));
+            group.bench_function(id, |bencher| {
+                bencher.iter_batched_ref(
+                    || drive.localizer.clone(),
+                    |localizer| localizer.run_stage(stage, scan),
+                    BatchSize::SmallInput,
+                );
+            });
+        }
+    }
+    group.finish();
+}
+
 /// The least: a table of free cells only, the beams' rows of log-likelihoods chosen before the loop.
 fn bare_kernel(group: &mut criterion::BenchmarkGroup<'_, criterion::measurement::WallTime>) {
     const DIRECTIONS: usize = 256;
@@ -144,5 +170,5 @@ fn map_building(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, whole_update, map_building);
+criterion_group!(benches, whole_update, stages, map_building);
 criterion_main!(benches);

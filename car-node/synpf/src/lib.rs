@@ -26,6 +26,8 @@ mod weigh;
 pub use beams::{BeamLayout, BeamParameters};
 pub use defects::Defects;
 pub use input::{Odometry, Scan, Stamp, Twist, YawRate};
+#[doc(hidden)]
+pub use localizer::Stage;
 pub use localizer::{Dropped, Hypothesis, Localizer, Mode, SetUpError, Tuning, Update, WeightedPose};
 pub use motion::{MotionModel, MotionParameters};
 pub use parameters::{ParameterFault, Parameters};

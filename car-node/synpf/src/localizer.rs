@@ -1,11 +1,15 @@
 //! The localizer: sensors in, poses out.
 
+mod stages;
+
 use std::sync::Arc;
 
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
+#[doc(hidden)]
+pub use self::stages::Stage;
 use crate::beams::ReadyScan;
 use crate::motion::Motion;
 use crate::odometry_track::OdometryTrack;
@@ -159,7 +163,7 @@ const FIT_MARGIN: f64 = 0.08;
 /// SynPF. One thread owns it; the map is shared.
 ///
 /// Inside, poses are in the grid's frame; see [`TrackMap`].
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Localizer {
     map: Arc<TrackMap>,
     base_link_from_laser: Pose,
@@ -189,7 +193,7 @@ pub struct Localizer {
 }
 
 /// What `defect_update_per_odometry` keeps: odometry is applied one message late.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 struct PerOdometry {
     last: Option<Odometry>,
     delayed: Pose,

@@ -76,10 +76,10 @@ impl Advisor {
         self.wanted = Some(Proposal {
             set: set.into(),
             evidence: format!(
-                "odometry was off (slip over {:.0} % or yaw rate by {:.1} rad/s) in {:.0} % of the last {WINDOW:.0} s",
+                "odometry off in {:.0} % of the last {WINDOW:.0} s (slip over {:.0} % or yaw rate by {:.1} rad/s)",
+                share * 100.0,
                 thresholds.slip * 100.0,
-                thresholds.yaw_rate_residual,
-                share * 100.0
+                thresholds.yaw_rate_residual
             ),
             since,
         });

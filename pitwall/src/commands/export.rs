@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use pitwall::{Fleet, Happening, read_events};
+use pitwall::{Fleet, Happening, RecordingError, read_events};
 use protocol::{Telemetry, Topic};
 use serde_json::json;
 
@@ -16,6 +16,9 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
     // Read before anything is written: a faulty recording leaves nothing behind.
     let events = read_events(file)?.collect::<Result<Vec<_>, _>>()?;
+    if events.is_empty() {
+        return Err(RecordingError::Empty(file.display().to_string()).into());
+    }
     fs::create_dir(&folder).with_context(|| format!("{}: nothing is overwritten", folder.display()))?;
     let create = |name: &str, head: &str| -> anyhow::Result<BufWriter<File>> {
         let path = folder.join(name);

@@ -26,7 +26,7 @@ pub(super) async fn run(link: &LinkOptions, page: Page, json: bool) -> anyhow::R
     }
     interrupted().await;
     #[cfg(feature = "rerun")]
-    views.iter().for_each(pitwall::RerunView::flush);
+    views.into_iter().for_each(pitwall::RerunView::finish);
     wall.stop().await;
     Ok(ExitCode::SUCCESS)
 }

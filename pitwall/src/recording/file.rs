@@ -281,20 +281,39 @@ pub enum RecordingError {
     #[error("{0} exists already; recordings are never overwritten")]
     Exists(String),
     /// The file cannot be opened, written or read.
-    #[error("{file}: {source}")]
+    #[error("{file}: {reason}")]
     Io {
         /// The file.
         file: String,
         /// What the system says.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
-    /// The file's format is broken, or writing it failed.
-    #[error("{file}: {source}")]
+    /// Writing the file failed.
+    #[error("{file}: {reason}")]
     Mcap {
         /// The file.
         file: String,
         /// What is wrong.
-        source: mcap::McapError,
+        reason: mcap::McapError,
+    },
+    /// The file is something else.
+    #[error("{0} is no recording: it does not begin as an MCAP file does")]
+    Foreign(String),
+    /// The file was cut off, or is damaged.
+    #[error("{file}: {reason}; `pitwall recover {file}` saves what can be read")]
+    Broken {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        reason: mcap::McapError,
+    },
+    /// Not one message can be read.
+    #[error("{file}: nothing can be saved, {reason}")]
+    Nothing {
+        /// The file.
+        file: String,
+        /// Why.
+        reason: String,
     },
     /// The file is a recording of nothing.
     #[error("{0} holds no event of any car")]
@@ -314,19 +333,34 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
-    pub(crate) fn io(file: &std::path::Path, source: std::io::Error) -> Self {
+    pub(crate) fn io(file: &std::path::Path, reason: std::io::Error) -> Self {
         let file = file.display().to_string();
-        if source.kind() == std::io::ErrorKind::AlreadyExists {
+        if reason.kind() == std::io::ErrorKind::AlreadyExists {
             Self::Exists(file)
         } else {
-            Self::Io { file, source }
+            Self::Io { file, reason }
         }
     }
 
-    pub(super) fn mcap(file: &std::path::Path, source: mcap::McapError) -> Self {
-        Self::Mcap {
-            file: file.display().to_string(),
-            source,
+    /// What went wrong while writing.
+    pub(super) fn mcap(file: &std::path::Path, reason: mcap::McapError) -> Self {
+        match reason {
+            mcap::McapError::Io(reason) => Self::io(file, reason),
+            reason => Self::Mcap {
+                file: file.display().to_string(),
+                reason,
+            },
+        }
+    }
+
+    /// What went wrong while reading.
+    pub(super) fn broken(file: &std::path::Path, reason: mcap::McapError) -> Self {
+        match reason {
+            mcap::McapError::Io(reason) => Self::io(file, reason),
+            reason => Self::Broken {
+                file: file.display().to_string(),
+                reason,
+            },
         }
     }
 }

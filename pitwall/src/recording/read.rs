@@ -1,7 +1,7 @@
 //! Reads a recording back: the same events as the live pit wall had.
 
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -21,11 +21,25 @@ pub struct Recording<R: Read> {
 
 /// Opens a recording. An unfinished one is an error at its end: [`recover`](super::recover()) it first.
 pub fn read_events(path: &Path) -> Result<Recording<BufReader<File>>, RecordingError> {
-    let file = File::open(path).map_err(|e| RecordingError::io(path, e))?;
+    let file = open(path)?;
     Ok(Recording {
         messages: MessageReader::new_with_options(BufReader::new(file), LinearReaderOptions::default()),
         path: path.to_owned(),
     })
+}
+
+/// Opens a file that begins as an MCAP file does.
+pub(super) fn open(path: &Path) -> Result<File, RecordingError> {
+    let io = |e| RecordingError::io(path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let mut begin = [0; mcap::MAGIC.len()];
+    match file.read_exact(&mut begin) {
+        Ok(()) if begin == mcap::MAGIC => {}
+        Err(error) if error.kind() != ErrorKind::UnexpectedEof => return Err(io(error)),
+        _ => return Err(RecordingError::Foreign(path.display().to_string())),
+    }
+    file.rewind().map_err(io)?;
+    Ok(file)
 }
 
 impl<R: Read> Iterator for Recording<R> {
@@ -35,7 +49,7 @@ impl<R: Read> Iterator for Recording<R> {
         loop {
             let message = match self.messages.next()? {
                 Ok(message) => message,
-                Err(error) => return Some(Err(RecordingError::mcap(&self.path, error))),
+                Err(error) => return Some(Err(RecordingError::broken(&self.path, error))),
             };
             let channel = message.channel.topic.as_str();
             let at = message.log_time as i64;

@@ -1,6 +1,6 @@
 //! Repairs a recording that was cut off, by a power cut or a kill.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::{BufReader, BufWriter};
 use std::path::Path;
 
@@ -10,6 +10,7 @@ use mcap::sans_io::LinearReaderOptions;
 use serde::Serialize;
 
 use super::file::RecordingError;
+use super::read::open;
 
 /// What could be saved.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -22,9 +23,10 @@ pub struct Recovered {
     pub damage: Option<String>,
 }
 
-/// Copies what can be read of `from` into the new file `to`, which ends as it should.
+/// Copies what can be read of `from` into the new file `to`, which ends as it should. Where nothing can be read, there
+/// is no new file.
 pub fn recover(from: &Path, to: &Path) -> Result<Recovered, RecordingError> {
-    let input = File::open(from).map_err(|e| RecordingError::io(from, e))?;
+    let input = open(from)?;
     let output = OpenOptions::new()
         .write(true)
         .create_new(true)
@@ -51,9 +53,59 @@ pub fn recover(from: &Path, to: &Path) -> Result<Recovered, RecordingError> {
         }
     }
     writer.finish().map_err(written)?;
+    if messages == 0 {
+        fs::remove_file(to).map_err(|e| RecordingError::io(to, e))?;
+        return Err(RecordingError::Nothing {
+            file: from.display().to_string(),
+            reason: damage.unwrap_or_else(|| "it holds no message".to_owned()),
+        });
+    }
     Ok(Recovered {
         messages,
         duration_s: span.map_or(0.0, |(a, b)| (b - a) as f64 * 1e-9),
         damage,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::read_events;
+
+    /// The message of an error, which names the file as `FILE`.
+    fn fault<T>(result: Result<T, RecordingError>, file: &Path) -> String {
+        let error = result.err().expect("a fault");
+        error.to_string().replace(&file.display().to_string(), "FILE")
+    }
+
+    #[test]
+    fn what_is_no_recording_is_told_so_and_leaves_nothing_behind() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [file, to] = ["file", "to"].map(|name| folder.path().join(name));
+        let told = fault(recover(&file, &to), &file);
+        assert!(told.starts_with("FILE: No such file"), "{told}");
+        for content in ["", "hello", "a text that is longer than the magic bytes"] {
+            fs::write(&file, content).expect("written");
+            let foreign = "FILE is no recording: it does not begin as an MCAP file does";
+            assert_eq!(fault(recover(&file, &to), &file), foreign);
+            assert_eq!(fault(read_events(&file), &file), foreign);
+        }
+        assert!(!to.exists());
+    }
+
+    #[test]
+    fn a_file_that_was_cut_off_at_once_names_the_way_out_and_has_nothing_to_save() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [file, to] = ["file", "to"].map(|name| folder.path().join(name));
+        fs::write(&file, mcap::MAGIC).expect("written");
+        let first = read_events(&file).expect("a begin").next().expect("a fault");
+        let told = fault(first, &file);
+        assert!(
+            told.ends_with("`pitwall recover FILE` saves what can be read"),
+            "{told}"
+        );
+        let told = fault(recover(&file, &to), &file);
+        assert!(told.starts_with("FILE: nothing can be saved"), "{told}");
+        assert!(!to.exists());
+    }
 }

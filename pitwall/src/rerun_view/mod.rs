@@ -1,25 +1,26 @@
 //! The same events for the Rerun viewer: history and depth beside the page.
 //!
 //! What the engineer acts on is on the page; this is to look back and into things. Data is decimated, the server's
-//! memory is capped, and nothing waits for a viewer.
+//! memory is capped, and nothing waits for a viewer: what does not fit into the queue is left out.
 
-use std::collections::HashMap;
+mod event_log;
+mod layout;
+
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
-use crossbeam_channel::Receiver;
-use protocol::{CarName, Cloud, Health, MapReply, Params, Pose, ScanView, Severity, Telemetry, Topic};
-use rerun::blueprint::{Blueprint, ContainerLike, Horizontal, Spatial3DView};
-use rerun::blueprint::{StateTimelineView, TextLogView, TimeSeriesView, Vertical};
+use crossbeam_channel::{Receiver, Sender, select};
 use rerun::grpc_server::GrpcServerSink;
+use rerun::log::ChunkBatcherConfig;
 use rerun::sink::{FileSink, LogSink};
 use rerun::{
-    Arrows3D, Boxes3D, Color, GridMap, LineStrips3D, MemoryLimit, PlaybackBehavior, Points3D, Quaternion,
-    RecordingStream, RecordingStreamBuilder, RecordingStreamError, Scalars, ServerOptions, StateChange,
-    TextLog, TextLogLevel, Transform3D,
+    MemoryLimit, PlaybackBehavior, RecordingStream, RecordingStreamBuilder, RecordingStreamError,
+    ServerOptions,
 };
 
-use crate::event::{FleetEvent, Happening};
+use crate::event::FleetEvent;
+use event_log::EventLog;
 
 /// Where the data goes.
 #[derive(Debug, Clone)]
@@ -32,9 +33,13 @@ pub enum RerunOutlet {
     Connect(String),
 }
 
-/// Data on its way to Rerun. Ends when the pit wall closes.
+/// Data on its way to Rerun. Dropping it ends it without waiting for anything.
 pub struct RerunView {
-    stream: RecordingStream,
+    /// Says that no more events are wanted, by being dropped.
+    closing: Sender<()>,
+    /// Hears that everything has been handed over, by being disconnected.
+    closed: Receiver<()>,
+    patience: Duration,
 }
 
 /// Why there is no such view.
@@ -42,7 +47,7 @@ pub struct RerunView {
 pub enum RerunError {
     /// Rerun refuses.
     #[error("rerun: {0}")]
-    Stream(#[from] RecordingStreamError),
+    Stream(String),
     /// The file cannot be written.
     #[error("{file}: {reason}")]
     File {
@@ -64,13 +69,27 @@ pub enum RerunError {
     Thread(std::io::Error),
 }
 
+impl From<RecordingStreamError> for RerunError {
+    fn from(error: RecordingStreamError) -> Self {
+        Self::Stream(error.to_string())
+    }
+}
+
 impl RerunView {
     /// History that the server keeps for viewers that come later [bytes].
     const MEMORY: u64 = 256 * 1024 * 1024;
+    /// Rows wait this long for others of their kind: five times fewer chunks than a live stream has by default, which
+    /// is what a viewer in a browser spends its time on.
+    const BATCH: Duration = Duration::from_millis(200);
 
     /// Begins to log `events`. [`RerunOutlet::Serve`] needs a tokio runtime.
     pub fn start(events: Receiver<Arc<FleetEvent>>, outlet: &RerunOutlet) -> Result<Self, RerunError> {
-        let builder = RecordingStreamBuilder::new("pitwall").with_blueprint(blueprint());
+        let builder = RecordingStreamBuilder::new("pitwall").batcher_config(ChunkBatcherConfig {
+            flush_tick: Self::BATCH,
+            ..ChunkBatcherConfig::DEFAULT
+        });
+        // A file is to be whole; whoever does not read at the other end of a link is not waited for.
+        let mut patience = Duration::from_secs(1);
         let stream = match outlet {
             RerunOutlet::Connect(url) => builder.connect_grpc_opts(url.as_str())?,
             RerunOutlet::Save(file) => {
@@ -78,6 +97,7 @@ impl RerunView {
                     file: file.display().to_string(),
                     reason: error.to_string(),
                 })?;
+                patience = Duration::from_secs(20);
                 with_sink(builder, Box::new(sink))?
             }
             &RerunOutlet::Serve(port) => {
@@ -94,255 +114,74 @@ impl RerunView {
                 with_sink(builder, Box::new(sink))?
             }
         };
-        let log = EventLog {
-            stream: stream.clone(),
-            last: HashMap::new(),
-            trails: HashMap::new(),
-        };
+        // Messages carry their own time.
+        stream.set_log_time_enabled(false);
+        let (closing, wanted) = crossbeam_channel::bounded::<()>(0);
+        let (done, closed) = crossbeam_channel::bounded::<()>(0);
         std::thread::Builder::new()
             .name("rerun".to_owned())
-            .spawn(move || log.run(&events))
+            .spawn(move || {
+                run(&stream, &events, &wanted, patience);
+                drop(done);
+            })
             .map_err(RerunError::Thread)?;
-        Ok(Self { stream })
+        Ok(Self {
+            closing,
+            closed,
+            patience,
+        })
     }
 
-    /// Writes out what is waiting; gives up after a second.
-    pub fn flush(&self) {
-        if let Err(error) = self.stream.flush_with_timeout(std::time::Duration::from_secs(1)) {
-            tracing::warn!(%error, "rerun");
+    /// Hands over what has come so far and ends. Gives up after a while, a second where it goes to a viewer.
+    pub fn finish(self) {
+        drop(self.closing);
+        if let Err(crossbeam_channel::RecvTimeoutError::Timeout) =
+            self.closed.recv_timeout(self.patience + Duration::from_secs(1))
+        {
+            tracing::warn!("rerun does not take the last of the data");
         }
+    }
+}
+
+/// Logs events until no more come or are wanted.
+fn run(
+    stream: &RecordingStream,
+    events: &Receiver<Arc<FleetEvent>>,
+    wanted: &Receiver<()>,
+    patience: Duration,
+) {
+    let mut log = EventLog::new(stream.clone());
+    let mut take = |event: &FleetEvent| {
+        log.take(event)
+            .inspect_err(|error| tracing::warn!(%error, "rerun"))
+            .is_ok()
+    };
+    loop {
+        select! {
+            recv(events) -> event => match event {
+                Ok(event) if take(&event) => {}
+                Ok(_) => return,
+                Err(_) => break,
+            },
+            recv(wanted) -> _ => {
+                // No longer than what had come by now.
+                events.try_iter().take(events.len()).all(|event| take(&event));
+                break;
+            }
+        }
+    }
+    if let Err(error) = log.finish() {
+        tracing::warn!(%error, "rerun");
+    }
+    match stream.flush_with_timeout(patience) {
+        // Closes a file with its index.
+        Ok(()) => stream.finalize_deferred_sinks(),
+        Err(error) => tracing::warn!(%error, "rerun"),
     }
 }
 
 fn with_sink(builder: RecordingStreamBuilder, sink: Box<dyn LogSink>) -> Result<RecordingStream, RerunError> {
-    // Buffered until the sink is there, so that the blueprint is not lost.
     let stream = builder.buffered()?;
     stream.set_sinks(vec![sink]);
     Ok(stream)
-}
-
-/// The track from above, lanes for state and set, curves, and what happened.
-fn blueprint() -> Blueprint {
-    let curves =
-        |name: &str, what: &str| TimeSeriesView::new(name).with_contents([format!("/plots/*/{what}")]);
-    let lanes = StateTimelineView::new("state and set").with_contents(["/lanes/**"]);
-    let right: [ContainerLike; 5] = [
-        lanes.into(),
-        curves("alignment", "alignment").into(),
-        curves("slip", "slip").into(),
-        curves("spread along [m]", "spread_along").into(),
-        TextLogView::new("events").with_contents(["/events/**"]).into(),
-    ];
-    let track = Spatial3DView::new("track").with_origin("/track");
-    let root = Horizontal::new([track.into(), Vertical::new(right).into()]).with_column_shares([3.0, 2.0]);
-    Blueprint::new(root)
-}
-
-/// Turns events into what Rerun draws.
-struct EventLog {
-    stream: RecordingStream,
-    last: HashMap<(CarName, Topic), i64>,
-    trails: HashMap<CarName, Vec<[f32; 3]>>,
-}
-
-impl EventLog {
-    /// Points of a trail: about twenty seconds.
-    const TRAIL: usize = 400;
-    /// Updates from one drawing of the trail to the next: about a second.
-    const TRAIL_EVERY: u64 = 40;
-
-    fn run(mut self, events: &Receiver<Arc<FleetEvent>>) {
-        for event in events {
-            if let Err(error) = self.log(&event) {
-                tracing::warn!(%error, "rerun");
-                return;
-            }
-        }
-    }
-
-    fn log(&mut self, event: &FleetEvent) -> Result<(), RecordingStreamError> {
-        let car = &event.car;
-        match &event.happening {
-            Happening::Map { map, .. } => self.stream.log_static("track/map", &grid(map)),
-            Happening::Message {
-                topic,
-                header,
-                telemetry,
-                ..
-            } => {
-                let at = if header.sensor == 0 {
-                    header.published
-                } else {
-                    header.sensor
-                };
-                if !self.due(car, *topic, at) {
-                    return Ok(());
-                }
-                self.stream.set_timestamp_nanos_since_epoch("time", at);
-                match &**telemetry {
-                    Telemetry::Pose(pose) => self.pose(car, pose),
-                    Telemetry::Cloud(cloud) => self.cloud(car, cloud),
-                    Telemetry::Scan(scan) => self.scan(car, scan),
-                    Telemetry::Health(health) => self.health(car, health),
-                    Telemetry::Params(params) => self.params(car, params),
-                    Telemetry::Event(event) => {
-                        let level = match event.kind.severity() {
-                            Severity::Info => TextLogLevel::INFO,
-                            Severity::Warning => TextLogLevel::WARN,
-                            Severity::Critical => TextLogLevel::ERROR,
-                        };
-                        let line = TextLog::new(event.kind.to_string()).with_level(level);
-                        self.stream.log(format!("events/{car}"), &line)
-                    }
-                    Telemetry::Load(load) => self.stream.log(
-                        format!("plots/{car}/update_ms"),
-                        &Scalars::single(f64::from(load.update_us.p99) / 1e3),
-                    ),
-                    Telemetry::Odometry(_)
-                    | Telemetry::RecordedScan(_)
-                    | Telemetry::Truth(_)
-                    | Telemetry::Shadow(_) => Ok(()),
-                }
-            }
-            _ => Ok(()),
-        }
-    }
-
-    /// True when enough time has passed since the last message of this kind that was drawn.
-    fn due(&mut self, car: &CarName, topic: Topic, at: i64) -> bool {
-        const MILLISECOND: i64 = 1_000_000;
-        let apart = match topic {
-            Topic::Pose => 50 * MILLISECOND,
-            Topic::Cloud | Topic::Scan => 200 * MILLISECOND,
-            Topic::Health => 100 * MILLISECOND,
-            Topic::Load | Topic::Params | Topic::Event => 0,
-            _ => return false,
-        };
-        let last = self.last.entry((car.clone(), topic)).or_insert(i64::MIN);
-        // A tenth less, so that a rate just at the limit is not halved.
-        let due = at.saturating_sub(*last) >= apart - apart / 10;
-        if due {
-            *last = at;
-        }
-        due
-    }
-
-    fn pose(&mut self, car: &CarName, pose: &Pose) -> Result<(), RecordingStreamError> {
-        let at = [pose.pose.x as f32, pose.pose.y as f32, 0.0];
-        let trail = self.trails.entry(car.clone()).or_default();
-        if trail.len() == Self::TRAIL {
-            trail.remove(0);
-        }
-        trail.push(at);
-        let colour = colour_of(car);
-        // The whole trail is logged each time, so not each time.
-        if pose.update % Self::TRAIL_EVERY < 2 {
-            let line = LineStrips3D::new([trail.clone()])
-                .with_colors([colour])
-                .with_radii([0.02]);
-            self.stream.log(format!("track/{car}/trail"), &line)?;
-        }
-        let body = format!("track/{car}/body");
-        let transform = Transform3D::from_translation_rotation(at, turned(pose.pose.heading));
-        self.stream.log(body.clone(), &transform)?;
-        let outline = Boxes3D::from_centers_and_half_sizes([[0.16, 0.0, 0.08]], [[0.26, 0.14, 0.08]])
-            .with_colors([colour])
-            .with_labels([car.as_str()]);
-        self.stream.log(format!("{body}/outline"), &outline)?;
-        let ahead =
-            Arrows3D::from_vectors([[pose.twist.linear_x as f32 * 0.2, 0.0, 0.0]]).with_colors([colour]);
-        self.stream.log(format!("{body}/speed"), &ahead)?;
-        let speed = pose.twist.linear_x.hypot(pose.twist.linear_y);
-        self.stream
-            .log(format!("plots/{car}/speed"), &Scalars::single(speed))
-    }
-
-    fn cloud(&self, car: &CarName, cloud: &Cloud) -> Result<(), RecordingStreamError> {
-        let point = |&particle| {
-            let pose = cloud.pose(particle);
-            [pose.x as f32, pose.y as f32, 0.02]
-        };
-        let points = Points3D::new(cloud.particles.iter().map(point))
-            .with_radii([0.01])
-            .with_colors([colour_of(car)]);
-        self.stream.log(format!("track/{car}/particles"), &points)
-    }
-
-    fn scan(&self, car: &CarName, scan: &ScanView) -> Result<(), RecordingStreamError> {
-        let points = scan.points.iter().map(|&end_point| {
-            let [x, y] = scan.point(end_point);
-            [x as f32, y as f32, 0.05]
-        });
-        let colours = scan
-            .points
-            .iter()
-            .map(|end_point| match u8::from(end_point.kind) {
-                0 => Color::from_rgb(76, 195, 138),
-                1 => Color::from_rgb(147, 160, 176),
-                2 => Color::from_rgb(245, 179, 66),
-                _ => Color::from_rgb(255, 93, 93),
-            });
-        let points = Points3D::new(points).with_radii([0.025]).with_colors(colours);
-        self.stream.log(format!("track/{car}/scan"), &points)
-    }
-
-    fn health(&self, car: &CarName, health: &Health) -> Result<(), RecordingStreamError> {
-        let state = StateChange::single(health.state.to_string());
-        self.stream.log(format!("lanes/{car}/state"), &state)?;
-        let Some(metrics) = &health.metrics else {
-            return Ok(());
-        };
-        for (name, value) in [
-            ("alignment", metrics.alignment),
-            ("residual", metrics.residual),
-            ("slip", metrics.slip),
-            ("spread_along", metrics.spread_along),
-            ("spread_across", metrics.spread_across),
-        ] {
-            self.stream
-                .log(format!("plots/{car}/{name}"), &Scalars::single(f64::from(value)))?;
-        }
-        Ok(())
-    }
-
-    fn params(&self, car: &CarName, params: &Params) -> Result<(), RecordingStreamError> {
-        let set = StateChange::single(params.set.name.as_str());
-        self.stream.log(format!("lanes/{car}/set"), &set)
-    }
-}
-
-/// The grid; its first row is its lowest, an image's its highest.
-fn grid(map: &MapReply) -> GridMap {
-    let cells = map.occupancy();
-    let rows: Vec<_> = cells.chunks(map.width.max(1) as usize).rev().collect();
-    let format = rerun::components::ImageFormat::from_color_model(
-        [map.width, map.height],
-        rerun::ColorModel::L,
-        rerun::ChannelDatatype::U8,
-    );
-    GridMap::new(rows.concat(), format, map.resolution as f32)
-        .with_translation([map.origin.x as f32, map.origin.y as f32, 0.0])
-        .with_quaternion(turned(map.origin.heading))
-        .with_colormap(rerun::components::Colormap::RvizMap)
-}
-
-/// A turn about the vertical [rad].
-fn turned(heading: f64) -> Quaternion {
-    let (sin, cos) = (heading / 2.0).sin_cos();
-    Quaternion::from_xyzw([0.0, 0.0, sin as f32, cos as f32])
-}
-
-/// A car's own colour, the same in every session.
-fn colour_of(car: &CarName) -> Color {
-    const COLOURS: [[u8; 3]; 6] = [
-        [90, 169, 255],
-        [255, 157, 92],
-        [185, 140, 255],
-        [47, 208, 200],
-        [255, 111, 174],
-        [216, 216, 74],
-    ];
-    let sum: usize = car.as_str().bytes().map(usize::from).sum();
-    let [r, g, b] = COLOURS[sum % COLOURS.len()];
-    Color::from_rgb(r, g, b)
 }

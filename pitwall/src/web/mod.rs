@@ -3,7 +3,7 @@
 //! ```text
 //! GET  /               the page and its files, embedded in the program
 //! GET  /ws             a snapshot of all cars 15 times a second, and log lines as they come;
-//!                      in: {"select": "car-1", "operator": "ana"}
+//!                      in: {"select": "car-1", "operator": "ana"}, {"drawn": 17}: ready for the next
 //! GET  /snapshot       one snapshot
 //! GET  /map/<car>      the map that a car localizes on
 //! POST /command        {car, operator, expected_revision, id, action}: waits for the car and says what became of it

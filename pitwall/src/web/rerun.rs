@@ -15,7 +15,8 @@ use crate::rerun_view::{RerunOutlet, RerunView};
 
 /// The data's server, once it runs.
 pub(super) struct Pane {
-    view: RerunView,
+    /// Ends when it is dropped.
+    _view: RerunView,
     port: u16,
 }
 
@@ -29,7 +30,7 @@ pub(super) async fn open(State(app): State<App>) -> Response {
         let started = free_port().map_err(|error| error.to_string()).and_then(|port| {
             let view = RerunView::start(app.board.tap(app.now()), &RerunOutlet::Serve(port))
                 .map_err(|e| e.to_string())?;
-            Ok(Pane { view, port })
+            Ok(Pane { _view: view, port })
         });
         match started {
             Ok(started) => *pane = Some(started),
@@ -87,12 +88,6 @@ fn without_foreign_fonts(page: &[u8]) -> Vec<u8> {
     }
     kept.push_str(rest);
     kept.into_bytes()
-}
-
-impl Drop for Pane {
-    fn drop(&mut self) {
-        self.view.flush();
-    }
 }
 
 /// A port on loopback that is free now.

@@ -27,6 +27,9 @@ const HISTORY: u64 = 300;
 const SLOW: Duration = Duration::from_secs(5);
 /// How often the selected car's lap is painted anew.
 const REPAINT: Duration = Duration::from_secs(1);
+/// A page that has not drawn its last snapshot gets no other for this long: it would wait in the browser and grow old
+/// there. A page in the background draws nothing, and lives on what comes then.
+const UNDRAWN: Duration = Duration::from_millis(400);
 
 /// All cars at one moment.
 #[derive(Serialize)]
@@ -35,6 +38,8 @@ pub(super) struct Snapshot {
     now: i64,
     /// When it was made, by the laptop's clock [unix ns].
     made: i64,
+    /// Counts the snapshots of this page, from 1.
+    number: u64,
     /// Another one than before: all that was said before is void.
     epoch: u64,
     cars: Vec<CarView>,
@@ -90,6 +95,22 @@ struct Selected {
 
 /// What a page says.
 #[derive(Deserialize)]
+#[serde(untagged)]
+enum Said {
+    Drawn(Drawn),
+    Wish(Wish),
+}
+
+/// It has drawn a snapshot.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Drawn {
+    /// Its number.
+    drawn: u64,
+}
+
+/// It wants something.
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Wish {
     /// The car whose particles and end points it wants.
@@ -101,6 +122,8 @@ struct Wish {
 /// What one page has been sent.
 #[derive(Default)]
 struct Seen {
+    /// The last snapshot.
+    number: u64,
     /// The last log line.
     log: u64,
     epoch: Option<u64>,
@@ -167,8 +190,12 @@ impl Snapshot {
         let epoch = fleet.epoch();
         let anew = seen.epoch.replace(epoch) != Some(epoch);
         if anew {
-            *seen = Self::anew(&fleet, epoch);
+            *seen = Seen {
+                number: seen.number,
+                ..Self::anew(&fleet, epoch)
+            };
         }
+        seen.number += 1;
         let log = fleet.log().since(seen.log).cloned().collect();
         seen.log = fleet.log().last();
         let hello = anew.then(|| Hello {
@@ -192,6 +219,7 @@ impl Snapshot {
         Self {
             now,
             made: crate::link::unix_now(),
+            number: seen.number,
             epoch,
             cars,
             maps,
@@ -213,7 +241,7 @@ impl Snapshot {
         Seen {
             log: fleet.log().last().saturating_sub(HISTORY),
             epoch: Some(epoch),
-            car: None,
+            ..Seen::default()
         }
     }
 }
@@ -229,16 +257,22 @@ pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) ->
         .on_upgrade(move |socket| follow(app, socket))
 }
 
-/// Sends snapshots until the page goes away. Each is made when it is sent: a slow page gets fewer, never older ones.
+/// Sends snapshots until the page goes away. Each is made when it is sent, and sent when the one before has been drawn:
+/// a slow page gets fewer, never older ones.
 async fn follow(app: App, mut socket: WebSocket) {
     let mut selected: Option<CarName> = None;
     let mut seen = Seen::nothing(&app);
     let present = app.present.enter();
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut drawn = 0;
+    let mut sent_at = Instant::now();
     loop {
+        let undrawn = drawn < seen.number && sent_at.elapsed() < UNDRAWN;
         tokio::select! {
-            _ = ticks.tick() => {
+            // When the page becomes ready after a tick that it has missed, the tick is taken at once.
+            _ = ticks.tick(), if !undrawn => {
+                sent_at = Instant::now();
                 let snapshot = Snapshot::take(&app, selected.as_ref(), &mut seen);
                 let Ok(text) = serde_json::to_string(&snapshot) else { return };
                 let sent = tokio::time::timeout(SLOW, socket.send(Message::Text(text.into()))).await;
@@ -246,9 +280,11 @@ async fn follow(app: App, mut socket: WebSocket) {
                     return;
                 }
             }
+            () = tokio::time::sleep(UNDRAWN.saturating_sub(sent_at.elapsed())), if undrawn => {}
             message = socket.recv() => match message {
-                Some(Ok(Message::Text(text))) => match serde_json::from_str::<Wish>(&text) {
-                    Ok(wish) => {
+                Some(Ok(Message::Text(text))) => match serde_json::from_str(&text) {
+                    Ok(Said::Drawn(said)) => drawn = said.drawn,
+                    Ok(Said::Wish(wish)) => {
                         selected = wish.select;
                         if let Some(mut operator) = wish.operator {
                             operator.truncate(operator.floor_char_boundary(Command::MAX_OPERATOR));

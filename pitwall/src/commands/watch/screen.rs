@@ -143,6 +143,8 @@ impl Shown {
         self.alarms = fleet.log().alarms();
         let from = fleet.log().last().saturating_sub(Self::LOG as u64);
         self.log = fleet.log().since(from).cloned().collect();
+        // What came late stands where it belongs.
+        self.log.sort_by_key(|entry| entry.at);
         let selected = self
             .cars
             .get(self.choice.car)
@@ -165,10 +167,14 @@ impl Shown {
 
     fn draw(&self, frame: &mut Frame<'_>) {
         let rows = self.cars.len().max(1) as u16 + 3;
+        // Where there is little room, all cars and their states stay; events go first.
+        let height = frame.area().height;
+        let cars = rows.min(height / 2);
+        let log = (height * 3 / 10).min(height.saturating_sub(cars + 9));
         let areas = Layout::vertical([
-            Constraint::Max(rows.min(frame.area().height / 2)),
-            Constraint::Min(11),
-            Constraint::Percentage(30),
+            Constraint::Length(cars),
+            Constraint::Fill(1),
+            Constraint::Length(if log < 3 { 0 } else { log }),
             Constraint::Length(1),
         ])
         .split(frame.area());
@@ -238,7 +244,8 @@ impl Shown {
         let Some(car) = self.cars.get(self.choice.car) else {
             return;
         };
-        let areas = Layout::vertical([Constraint::Min(8), Constraint::Length(3)]).split(area);
+        let chart = if area.height < 11 { 0 } else { 3 };
+        let areas = Layout::vertical([Constraint::Fill(1), Constraint::Length(chart)]).split(area);
         let block = Block::bordered()
             .title(format!(" {} ", car.car))
             .border_style(style_of(&car.state));
@@ -454,6 +461,14 @@ mod tests {
             "2 not acknowledged",
         ] {
             assert!(text.contains(expected), "{expected:?} is not in\n{text}");
+        }
+    }
+
+    #[test]
+    fn a_small_terminal_keeps_the_states_of_all_cars() {
+        for (width, height) in [(70, 18), (80, 24), (60, 12)] {
+            let text = picture(&shown(), width, height);
+            assert!(text.contains("□ BLIND"), "{width}x{height}:\n{text}");
         }
     }
 

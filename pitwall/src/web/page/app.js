@@ -17,6 +17,10 @@ let pace = "";
 /// How old snapshots were when they had been drawn [ms], the last thousand: for whoever measures this page.
 const ages = [];
 
+/// Candidates are shown this long at most [ms]: meanwhile the car drives on.
+const OFFERED = 30e3;
+let offered = { at: 0, searching: false };
+
 const operator = $("operator");
 operator.value = localStorage.getItem("operator") || "engineer";
 
@@ -84,6 +88,7 @@ function take(next) {
     }
   }
   const index = next.cars.findIndex((car) => car.car === selected);
+  outdate(next.cars[index]);
   if (next.selected?.laps) laps = { car: next.selected.car, laps: next.selected.laps };
   if (!$("laps-panel").hidden) {
     showStandings($("standings"), next.cars, select);
@@ -93,6 +98,7 @@ function take(next) {
   if (!$("large").hidden && index >= 0) big.update(next.cars[index], index, cards.history(selected), next.now / 1e9);
   // After this frame is drawn.
   requestAnimationFrame(() => {
+    link.drawn(next.number);
     ages.push(Date.now() - next.made / 1e6);
     if (ages.length > 1000) ages.shift();
   });
@@ -178,16 +184,27 @@ async function placed(x, y, heading) {
   await act(selected, { pose: { x, y, heading } });
 }
 
-/// Shows where the car may be, on the track and as buttons.
+/// Shows where the car may be, on the track and as buttons. Scores only compare places with each other.
 function offer(candidates) {
   track.candidates = candidates;
+  offered = { at: performance.now(), searching: false };
   $("candidates").hidden = candidates.length < 2;
+  const best = Math.max(...candidates.map(({ score }) => score));
   $("candidates").replaceChildren(...candidates.map(({ number, score }) => {
-    const button = element("button", "", `${number}: ${fixed(score * 100, 0)} %`);
+    const button = element("button", "", score === best ? `${number}: best` : `${number}: ${fixed(score / best * 100, 0)} %`);
+    button.title = `follow place ${number}${score === best ? "" : ", which fits the scans this well beside the best"}`;
     button.addEventListener("click", () => picked(number));
     return button;
   }));
   $("hint").textContent = candidates.length > 1 ? `${selected} may be in ${candidates.length} places and follows the first: pick another, here or on the track` : "";
+}
+
+/// Takes the candidates away once the car knows where it is, or they are old.
+function outdate(car) {
+  if (!track.candidates.length || !car) return;
+  if (car.state !== "LOCALIZED") offered.searching = true;
+  const age = performance.now() - offered.at;
+  if (age > OFFERED || (offered.searching && car.state === "LOCALIZED")) offer([]);
 }
 
 async function search(car = selected) {
@@ -216,7 +233,7 @@ function paint() {
   const colours = palette();
   $("legend-paint").replaceChildren(element("span", "", name), ...legend.map(([colour, text]) => {
     const item = element("span");
-    const swatch = element("i");
+    const swatch = element("i", colour);
     swatch.style.background = colours[colour];
     item.append(swatch, text);
     return item;

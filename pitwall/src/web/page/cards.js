@@ -39,12 +39,15 @@ export const element = (tag, className, text) => {
 
 export const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 
+/// How old the pose is.
+const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed(pose && pose.age_s * 1e3, 0, " ms"));
+
 export const missing = (car) => Object.values(car.streams).reduce((sum, s) => sum + s.missing, 0);
 
 /// Label, text, what is off about it, and what it means.
 export const FACTS = [
   ["speed", (c) => fixed(c.pose?.speed_mps, 1, " m/s"), null, "over ground"],
-  ["age", (c) => fixed(c.pose && c.pose.age_s * 1e3, 0, " ms"), (c) => c.pose?.age_s > 0.15, "how long ago the pose shown was true"],
+  ["age", (c) => age(c), (c) => c.pose?.age_s > 0.15, "how long ago the pose shown was true"],
   ["alignment", (c) => fixed(c.health?.metrics && c.health.metrics.alignment * 100, 0, " %"), (c) => c.health?.metrics?.alignment < 0.7, "share of the beams that end at a wall of the map"],
   ["slip", (c) => fixed(c.health?.metrics && c.health.metrics.slip * 100, 0, " %"), (c) => Math.abs(c.health?.metrics?.slip) > 0.08, "share of odometry's distance that was not driven"],
   ["last lap", (c) => fixed(c.last_lap_s, 2, " s"), null, "the last lap"],
@@ -207,7 +210,7 @@ class Card {
     const hidden = this.root.parentElement?.classList.contains("many") && !selected;
     if (hidden) {
       setText(this.brief, [lasting(car.state_for_s), car.set?.name ?? "–", fixed(car.health?.metrics && car.health.metrics.alignment * 100, 0, " %"),
-        fixed(car.pose && car.pose.age_s * 1e3, 0, " ms")].join(" · "));
+        age(car)].join(" · "));
     } else {
       FACTS.forEach(([, text, off], i) => {
         setText(this.facts[i], text(car));
@@ -238,6 +241,9 @@ class Card {
     for (const [name, button] of this.setButtons) {
       const pressed = String(name === set?.name);
       if (button.getAttribute("aria-pressed") !== pressed) button.setAttribute("aria-pressed", pressed);
+      const proposed = car.health?.proposal?.set === name;
+      button.classList.toggle("proposed", proposed);
+      setText(button, proposed ? `▸ ${name}` : name);
     }
     if (this.sets.title !== title) this.sets.title = title;
     this.revision = set?.revision ?? null;

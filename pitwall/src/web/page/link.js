@@ -42,6 +42,8 @@ export function connect(onSnapshot, onLink) {
   return {
     select(car) { wish.select = car; tell(); },
     operator(name) { wish.operator = name; tell(); },
+    /// Asks for the next snapshot: none is sent while one waits to be drawn.
+    drawn(number) { if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ drawn: number })); },
   };
 }
 

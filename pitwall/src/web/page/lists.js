@@ -47,13 +47,15 @@ export class Log {
 
   open(entry) { return entry.severity === "critical" && entry.number > this.acknowledged; }
 
-  /// Adds a line at the top; one that says the same as the one below it is counted there.
+  /// Adds a line, the newest at the top; one that says the same as the one below it is counted there.
   show(entry) {
-    const top = this.list.firstChild;
+    // What came late goes where it belongs.
+    let below = this.list.firstChild;
+    while (below && Number(below.dataset.at) > entry.at) below = below.nextSibling;
     const text = this.text(entry);
-    if (top && top.dataset.text === text && !this.open(entry)) {
-      top.dataset.count = Number(top.dataset.count) + 1;
-      top.lastChild.textContent = `×${top.dataset.count}`;
+    if (below && below.dataset.text === text && !this.open(entry)) {
+      below.dataset.count = Number(below.dataset.count) + 1;
+      below.lastChild.textContent = `×${below.dataset.count}`;
       return;
     }
     const marker = entry.kind === "marker" ? " marker" : "";
@@ -61,9 +63,10 @@ export class Log {
     line.dataset.text = text;
     line.dataset.count = 1;
     line.dataset.number = entry.number;
+    line.dataset.at = entry.at;
     const time = new Date(entry.at / 1e6).toTimeString().slice(0, 8);
     line.append(element("time", "", time), text, element("b"));
-    this.list.prepend(line);
+    this.list.insertBefore(line, below);
   }
 
   text(entry) {

@@ -4,6 +4,8 @@ import { STATES, colourOf, fixed } from "/cards.js";
 
 /// Length of a trail [s]; of those not selected, where there are many.
 const TRAIL_S = 12, SHORT_TRAIL_S = 3, MANY = 6;
+/// What is shown around the raceline, so that the walls are seen [m].
+const MARGIN = 2.4;
 const END_POINTS = ["good", "quiet", "warn", "bad"];
 
 let colours = null;
@@ -19,6 +21,9 @@ export function palette() {
   }
   return colours;
 }
+
+/// Width of what is painted, beside that of what is well: who cannot tell the colours sees the width.
+const WIDTHS = { good: 1, busy: 1.6, warn: 1.8, bad: 2.8 };
 
 /// What can be painted along the track: name, colour of a place, legend.
 const PAINTS = {
@@ -145,7 +150,7 @@ export class Track {
       points = [[0, 0], [w, 0], [w, h], [0, h]].map(([u, v]) => [x + c * u - s * v, y + s * u + c * v]);
     }
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
-    const [left, right, low, high] = [Math.min(...xs) - 1.6, Math.max(...xs) + 1.6, Math.min(...ys) - 1.6, Math.max(...ys) + 1.6];
+    const [left, right, low, high] = [Math.min(...xs) - MARGIN, Math.max(...xs) + MARGIN, Math.min(...ys) - MARGIN, Math.max(...ys) + MARGIN];
     // The tools take the lowest part.
     const tools = 48;
     const scale = Math.min(width / (right - left), (height - tools) / (high - low));
@@ -249,7 +254,8 @@ export class Track {
     const selected = this.snapshot.selected;
     if (selected && selected.car === this.selected) this.drawSelected(context, selected, pixel, colour);
     this.snapshot.cars.forEach((car, i) => this.drawCar(context, car, i, pixel, colour));
-    for (const candidate of this.candidates) this.drawCandidate(context, candidate, pixel, colour);
+    // The best last, and so on top.
+    for (const candidate of [...this.candidates].reverse()) this.drawCandidate(context, candidate, pixel, colour);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.drawNames(context, colour);
     if (this.drag && this.placing) this.drawPlacing(context, colour);
@@ -282,12 +288,14 @@ export class Track {
     const line = map.raceline?.points ?? [];
     if (!strip?.length || line.length < 3) return;
     const [colourOfPlace] = PAINTS[this.paint];
-    context.lineWidth = Math.max(0.3, 7 * pixel);
-    context.globalAlpha = 0.55;
+    const width = Math.max(0.2, 5 * pixel);
+    context.globalAlpha = 0.7;
     strip.forEach((place, i) => {
       if (!place) return;
       const [from, to] = [i, i + 1].map((k) => Math.round(k / strip.length * line.length));
-      context.strokeStyle = colour[colourOfPlace(place)];
+      const name = colourOfPlace(place);
+      context.strokeStyle = colour[name];
+      context.lineWidth = width * (WIDTHS[name] ?? 1);
       context.beginPath();
       for (let k = from; k <= to; k++) {
         const [x, y] = line[k % line.length];
@@ -357,7 +365,7 @@ export class Track {
     context.translate(x, y);
     context.rotate(heading);
     // As large as the car is, but never too small to be seen. base_link is the rear axle.
-    const size = Math.max(1, 14 * pixel / 0.5);
+    const size = Math.max(1, 18 * pixel / 0.5);
     context.scale(size, size);
     context.beginPath();
     context.moveTo(0.42, 0);
@@ -386,7 +394,9 @@ export class Track {
       context.font = `${chosen ? "700 14px" : "13px"} system-ui, sans-serif`;
       const silent = car.blind ? ` ${fixed(car.quiet_s, 0)} s` : "";
       const label = `${(STATES[car.state] ?? ["?"])[0]} ${car.car}${silent}`;
-      const [x, width] = [px + 14, context.measureText(label).width];
+      const width = context.measureText(label).width;
+      // To the left of a car at the right edge.
+      const x = px + 14 + width > this.canvas.clientWidth ? px - 14 - width : px + 14;
       let y = py - 10;
       while (placed.some((other) => Math.abs(other.y - y) < 15 && x < other.x + other.width + 4 && other.x < x + width + 4)) y -= 15;
       placed.push({ x, y, width });
@@ -396,20 +406,25 @@ export class Track {
     });
   }
 
-  drawCandidate(context, { pose, number, score }, pixel, colour) {
+  drawCandidate(context, { pose, number }, pixel, colour) {
     context.save();
     context.translate(pose.x, pose.y);
     context.strokeStyle = colour.warn;
     context.lineWidth = 2 * pixel;
+    context.fillStyle = colour.ground;
     context.beginPath();
-    context.arc(0, 0, 12 * pixel, 0, 2 * Math.PI);
     context.moveTo(0, 0);
-    context.lineTo(24 * pixel * Math.cos(pose.heading), 24 * pixel * Math.sin(pose.heading));
+    context.lineTo(26 * pixel * Math.cos(pose.heading), 26 * pixel * Math.sin(pose.heading));
+    context.stroke();
+    context.beginPath();
+    context.arc(0, 0, 11 * pixel, 0, 2 * Math.PI);
+    context.fill();
     context.stroke();
     context.scale(pixel, -pixel);
     context.font = "700 13px system-ui, sans-serif";
+    context.textAlign = "center";
     context.fillStyle = colour.warn;
-    context.fillText(`${number}: ${Math.round(score * 100)} %`, 14, -14);
+    context.fillText(String(number), 0, 5);
     context.restore();
   }
 

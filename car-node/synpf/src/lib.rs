@@ -20,6 +20,7 @@ mod search;
 mod sensor;
 mod slip;
 mod slip_model;
+mod surprise;
 mod track_map;
 mod weigh;
 

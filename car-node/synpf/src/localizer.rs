@@ -17,9 +17,10 @@ use crate::particles::{Belief, Particles};
 use crate::quality::Quality;
 use crate::recovery::Doubt;
 use crate::refine::{Estimate, fit, refine, wall_offset};
-use crate::search::Search;
+use crate::search::{Search, fit_of};
 use crate::slip::{Slip, SlipWindow};
 use crate::slip_model::SlipModel;
+use crate::surprise::Surprise;
 use crate::weigh::{Ranges, Weigher};
 use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
 
@@ -181,6 +182,7 @@ pub struct Localizer {
     number: u64,
     search: Search,
     doubt: Doubt,
+    surprise: Surprise,
     slip_window: SlipWindow,
     slip: Slip,
     slip_model: SlipModel,
@@ -233,6 +235,7 @@ impl Localizer {
             number: 0,
             search: Search::default(),
             doubt: Doubt::default(),
+            surprise: Surprise::default(),
             slip_window: SlipWindow::default(),
             slip: Slip::default(),
             slip_model: SlipModel::default(),
@@ -277,6 +280,7 @@ impl Localizer {
         self.mode = Mode::Tracking;
         self.search = Search::default();
         self.doubt.clear();
+        self.surprise = Surprise::default();
         self.slip_window.clear();
         self.slip = Slip::default();
         self.slip_model.forget_pose();
@@ -288,6 +292,7 @@ impl Localizer {
         self.mode = Mode::Searching;
         self.search = Search::default();
         self.doubt.clear();
+        self.surprise = Surprise::default();
         self.slip_window.clear();
     }
 
@@ -580,6 +585,8 @@ impl Localizer {
             self.w_ratio = self
                 .doubt
                 .push(quality.clear_alignment().max(0.02), quality.alignment, recovery);
+            self.surprise
+                .push(fit_of(&self.map, &self.scan, self.estimate.pose), recovery);
             let lost = self.settled > 10
                 && self.doubt.lost(
                     quality.clear_alignment(),
@@ -625,6 +632,7 @@ impl Localizer {
         if !self.doubt.asks(
             quality.clear_alignment(),
             self.w_ratio,
+            self.surprise.least().is_some(),
             seconds,
             &self.parameters.recovery,
         ) {
@@ -635,6 +643,7 @@ impl Localizer {
             &self.scan,
             self.estimate.pose,
             self.doubt.sudden(),
+            self.surprise.least(),
             &self.parameters,
         ) {
             Some(search) => {

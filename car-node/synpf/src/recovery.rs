@@ -30,6 +30,8 @@ pub struct RecoveryParameters {
     pub doubt_ratio: f64,
     /// How long the doubt must last before that [s].
     pub doubt_after: f64,
+    /// A fit of two scans that is below the usual one by this many times its usual variation raises the doubt at once.
+    pub surprise: f64,
 }
 
 impl Default for RecoveryParameters {
@@ -46,6 +48,7 @@ impl Default for RecoveryParameters {
             lost_after: 0.25,
             doubt_ratio: 0.8,
             doubt_after: 0.1,
+            surprise: 5.0,
         }
     }
 }
@@ -64,6 +67,7 @@ impl RecoveryParameters {
         check.range("lost_after", self.lost_after, 0.05, 10.0);
         check.range("doubt_ratio", self.doubt_ratio, 0.0, 1.0);
         check.range("doubt_after", self.doubt_after, 0.02, 10.0);
+        check.range("surprise", self.surprise, 1.0, 1000.0);
     }
 }
 
@@ -147,18 +151,20 @@ impl Doubt {
 
     /// True when the scan has fitted worse than before for long enough, or suddenly worse, to ask whether another place
     /// fits better.
-    /// `ratio` is `w_fast / w_slow`. An opponent in view looks the same at first; the comparison tells them apart.
+    /// `ratio` is `w_fast / w_slow`; `surprised` says that the fit is below what is usual. An opponent in view looks the same at first; the comparison tells them apart.
     pub(crate) fn asks(
         &mut self,
         alignment: f64,
         ratio: f64,
+        surprised: bool,
         seconds: f64,
         parameters: &RecoveryParameters,
     ) -> bool {
         let [wait, next] = self.patience;
         self.sudden_for = (self.sudden_for - seconds).max(0.0);
         self.patience[0] = (wait - seconds).max(0.0);
-        if (ratio > parameters.doubt_ratio && !self.sudden()) || alignment > 0.85 {
+        let fell = (ratio <= parameters.doubt_ratio || self.sudden()) && alignment <= 0.85;
+        if !fell && !surprised {
             self.doubted_for = 0.0;
             if ratio > 0.95 {
                 self.patience[1] = 0.0;
@@ -166,7 +172,8 @@ impl Doubt {
             return false;
         }
         self.doubted_for += seconds;
-        if self.doubted_for < parameters.doubt_after - 1e-3 || self.patience[0] > 0.0 {
+        let long_enough = surprised || self.doubted_for >= parameters.doubt_after - 1e-3;
+        if !long_enough || self.patience[0] > 0.0 {
             return false;
         }
         let wait = (2.0 * next).clamp(0.1, MOST_PATIENCE);
@@ -231,7 +238,7 @@ mod tests {
         let parameters = RecoveryParameters::default();
         let mut doubt = Doubt::default();
         let asked: Vec<usize> = (0..400)
-            .filter(|_| doubt.asks(0.5, 0.6, 0.025, &parameters))
+            .filter(|_| doubt.asks(0.5, 0.6, false, 0.025, &parameters))
             .collect();
         assert_eq!(asked[0], 3);
         let pauses: Vec<usize> = asked.windows(2).map(|pair| pair[1] - pair[0]).collect();
@@ -240,7 +247,7 @@ mod tests {
             "{asked:?}"
         );
         assert!(
-            !doubt.asks(0.95, 0.6, 1.0, &parameters),
+            !doubt.asks(0.95, 0.6, false, 1.0, &parameters),
             "a scan that fits raises no doubt"
         );
     }

@@ -181,12 +181,13 @@ impl Search {
     }
 
     /// Looks for a pose elsewhere that explains a scan clearly better than `pose` does; with what was found, a
-    /// search can begin.
+    /// search can begin. `usual` is the least fit that scans usually have, where this one is below it.
     pub(crate) fn second_opinion(
         map: &TrackMap,
         scan: &ReadyScan,
         pose: Pose,
         sudden: bool,
+        usual: Option<f64>,
         parameters: &Parameters,
     ) -> Option<Self> {
         let mut search = Self {
@@ -198,8 +199,9 @@ impl Search {
         let own = score(map, scan, pose);
         // One scan often fits several places of a large map, and where something stands in view or the map is out of
         // date, another one better: a pose that explains the scan in good part is not given up for that, unless the fit
-        // has fallen from one scan to the next.
-        if explains(own) && !sudden {
+        // has fallen from one scan to the next, or is worse than usual while the other place explains as much as usual.
+        let as_usual = usual.is_some_and(|least| best.score >= INDEPENDENT * least.max(0.02).ln());
+        if explains(own) && !sudden && !as_usual {
             return None;
         }
         let elsewhere = !same(best.estimate.pose, pose);
@@ -210,6 +212,11 @@ impl Search {
 /// Whether a score is that of a pose which explains a scan, at least in good part.
 fn explains(score: f64) -> bool {
     score > INDEPENDENT * 0.35f64.ln()
+}
+
+/// How well a scan's end points lie on walls at a pose, in [0, 1]: what scores are made of.
+pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
+    fit(map.field(), &scan.points, BEAMS, pose, 0.08)
 }
 
 fn same(a: Pose, b: Pose) -> bool {
@@ -225,7 +232,7 @@ fn score(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
     if on_track.is_none_or(|distance| distance <= 0.0) {
         return INDEPENDENT * 0.02f64.ln();
     }
-    INDEPENDENT * fit(map.field(), &scan.points, BEAMS, pose, 0.08).max(0.02).ln()
+    INDEPENDENT * fit_of(map, scan, pose).max(0.02).ln()
 }
 
 /// How near a wall is, coarsely and in few bytes, so that a whole map stays in a processor's cache while every

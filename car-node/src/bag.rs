@@ -46,15 +46,15 @@ pub struct Topics {
 }
 
 /// The usual names, preferred first.
-const SCAN_NAMES: [&str; 1] = ["/scan"];
-const ODOMETRY_NAMES: [&str; 4] = [
+pub(crate) const SCAN_NAMES: [&str; 1] = ["/scan"];
+pub(crate) const ODOMETRY_NAMES: [&str; 4] = [
     "/early_fusion/odom",
     "/state_estimation/odom",
     "/vesc/odom",
     "/odom",
 ];
-const TRUTH_NAMES: [&str; 1] = ["/ground_truth/odom"];
-const IMU_NAMES: [&str; 2] = ["/sensors/imu/raw", "/imu"];
+pub(crate) const TRUTH_NAMES: [&str; 1] = ["/ground_truth/odom"];
+pub(crate) const IMU_NAMES: [&str; 2] = ["/sensors/imu/raw", "/imu"];
 
 /// Why a bag cannot be used.
 #[derive(Debug, thiserror::Error)]

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use car_node::evaluate::{Fault, Start};
 use car_node::node::Begin;
+use car_node::source::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
@@ -48,6 +49,8 @@ pub(crate) enum SourceKind {
     Bag,
     /// A simulated car that races on a simulated track.
     Simulator,
+    /// Live sensors of a ROS 2 car, off rmw_zenoh's router or a zenoh-bridge-ros2dds.
+    Ros2,
 }
 
 /// How well a simulated car's tyres hold.
@@ -68,6 +71,12 @@ pub(crate) struct Run {
     /// ROS 2 bag (MCAP) to play.
     #[arg(long, value_name = "FILE.mcap", required_if_eq("source", "bag"))]
     pub(crate) bag: Option<PathBuf>,
+    /// With --source ros2: the zenoh router (rmw_zenohd) or bridge of the ROS side.
+    #[arg(long, value_name = "ENDPOINT", default_value = Ros2Options::ENDPOINT)]
+    pub(crate) ros: String,
+    /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
+    #[arg(long, value_name = "N")]
+    pub(crate) ros_domain: Option<u32>,
     /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
     #[arg(long, value_name = "MAP.yaml|TRACK")]
     pub(crate) map: PathBuf,
@@ -78,7 +87,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) params: Option<String>,
     /// Pose of base_link in the map at the start [m, m, rad]; `truth` takes it from the source, `global` searches
-    /// the map [default: truth for the simulator, global for a bag].
+    /// the map [default: truth for the simulator, else global].
     #[arg(long, value_name = "X,Y,HEADING|truth|global", value_parser = begin, allow_hyphen_values = true)]
     pub(crate) initial_pose: Option<Begin>,
     /// The car's name on the network.
@@ -109,27 +118,27 @@ pub(crate) struct Run {
     /// Grip of the simulated car.
     #[arg(long, value_enum, default_value = "hq")]
     pub(crate) odometry: Odometry,
-    /// Which topics of the bag to take.
+    /// Which topics to take.
     #[command(flatten)]
     pub(crate) topics: TopicArguments,
 }
 
-/// Which topics of a bag to take, and what it does not say.
+/// Which topics of a bag, or of a live car, to take, and what they do not say.
 #[derive(Debug, Args)]
 pub(crate) struct TopicArguments {
-    /// Laser scans (sensor_msgs/LaserScan) [default: what is in the bag].
+    /// Laser scans (sensor_msgs/LaserScan) [default: what is there].
     #[arg(long, value_name = "TOPIC")]
     pub(crate) scan_topic: Option<String>,
-    /// Wheel odometry (nav_msgs/Odometry) [default: what is in the bag, fused odometry first].
+    /// Wheel odometry (nav_msgs/Odometry) [default: what is there, fused odometry first].
     #[arg(long, value_name = "TOPIC")]
     pub(crate) odom_topic: Option<String>,
     /// True poses (nav_msgs/Odometry or geometry_msgs/PoseStamped) [default: /ground_truth/odom, if there].
     #[arg(long, value_name = "TOPIC")]
     pub(crate) truth_topic: Option<String>,
-    /// Gyroscope (sensor_msgs/Imu) [default: what is in the bag, if any].
+    /// Gyroscope (sensor_msgs/Imu) [default: what is there, if any].
     #[arg(long, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
-    /// Pose of the laser on base_link [m, m, rad] [default: by /tf_static; 0.27 m ahead in a bag without it].
+    /// Pose of the laser on base_link [m, m, rad] [default: by /tf_static; 0.27 m ahead without it].
     #[arg(long, value_name = "X,Y,HEADING", value_parser = pose, allow_hyphen_values = true)]
     pub(crate) laser: Option<Pose>,
 }

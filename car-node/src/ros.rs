@@ -283,6 +283,17 @@ pub struct PoseStamped {
     pub pose: RosPose,
 }
 
+/// `geometry_msgs/PoseWithCovarianceStamped`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PoseWithCovarianceStamped {
+    /// Time and frame.
+    pub header: Header,
+    /// The pose.
+    pub pose: RosPose,
+    /// Its covariance.
+    pub covariance: Covariance,
+}
+
 /// `geometry_msgs/TransformStamped`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct TransformStamped {

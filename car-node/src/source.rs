@@ -1,16 +1,19 @@
 //! Where sensor data comes from: one thread that hands each message to the filter when it is due.
 
 mod bag_player;
+mod ros2;
 mod simulated;
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TrySendError};
 use maps::Pose;
 use synpf::{Stamp, Twist};
 
 pub use bag_player::BagPlayer;
+pub use ros2::{Ros2, Ros2Error, Ros2Options};
 pub use simulated::{Incident, Race, ScriptedIncident, SimulatedCar};
 
 use crate::bag::SensorEvent;
@@ -43,6 +46,17 @@ pub struct Belief {
     pub twist: Twist,
 }
 
+/// What a source has to give.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// A message, and when it arrives.
+    Due(Stamp, Feed),
+    /// Nothing has come for a while; more may.
+    Quiet,
+    /// Nothing more will come.
+    End,
+}
+
 /// Delivers a car's sensor data in the order in which it arrives.
 pub trait Source: Send {
     /// What it is, in words.
@@ -53,8 +67,8 @@ pub trait Source: Send {
     fn clock(&mut self, rate: f64) -> SensorClock;
     /// Where the car begins, if the source knows.
     fn start(&self) -> Option<Pose>;
-    /// The next message, and when it arrives; None at the end. `belief` is what the filter last said.
-    fn next(&mut self, belief: Option<Belief>) -> Option<(Stamp, Feed)>;
+    /// What comes next; waits for it no longer than a tenth of a second. `belief` is what the filter last said.
+    fn next(&mut self, belief: Option<Belief>) -> Next;
 }
 
 /// A place for the latest belief: the filter writes it, the source reads it.
@@ -77,12 +91,15 @@ pub fn play(
     thread::Builder::new().name("source".into()).spawn(move || {
         loop {
             let latest = *belief.lock().unwrap_or_else(PoisonError::into_inner);
-            let Some((due, feed)) = source.next(latest) else {
-                return;
+            let (wait, feed) = match source.next(latest) {
+                Next::Due(due, feed) => (clock.until(due), Some(feed)),
+                Next::Quiet => (Duration::ZERO, None),
+                Next::End => return,
             };
-            if stop.recv_timeout(clock.until(due)) != Err(RecvTimeoutError::Timeout) {
+            if stop.recv_timeout(wait) != Err(RecvTimeoutError::Timeout) {
                 return;
             }
+            let Some(feed) = feed else { continue };
             match filter.try_send(feed) {
                 Ok(()) => {}
                 Err(TrySendError::Full(_)) => counters.overrun(),

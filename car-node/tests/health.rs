@@ -9,7 +9,7 @@ use car_node::bag::{Arrival, SensorEvent, SensorLog, Topics};
 use car_node::evaluate::{self, Fault, FaultReport, Outcome, Start, Truth};
 use car_node::frames::Mount;
 use car_node::health::State;
-use car_node::source::{Belief, Feed, Race, Source};
+use car_node::source::{Belief, Feed, Next, Race, Source};
 use maps::{Cell, OccupancyGrid, Pose};
 use simulator::{CarSetup, Guidance, Surface, Track, Wall, Walls};
 use synpf::{Localizer, Parameters, TrackMap};
@@ -40,7 +40,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
     };
     let mut belief: Option<Belief> = None;
     let mut begun = None;
-    while let Some((due, feed)) = car.next(belief.take()) {
+    while let Next::Due(due, feed) = car.next(belief.take()) {
         let elapsed = due.since(*begun.get_or_insert(due));
         if elapsed > seconds {
             break;

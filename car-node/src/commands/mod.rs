@@ -37,26 +37,33 @@ fn say(line: &str) {
 
 /// Reads what a localizer needs of a bag.
 fn read_bag(bag: &Path, arguments: &TopicArguments) -> anyhow::Result<SensorLog> {
-    let topics = Topics {
+    let mount = arguments.laser.map(Mount::upright);
+    Ok(Bag::read(bag)?.sensors(&topics(arguments), mount)?)
+}
+
+fn topics(arguments: &TopicArguments) -> Topics {
+    Topics {
         scan: arguments.scan_topic.clone(),
         odometry: arguments.odom_topic.clone(),
         truth: arguments.truth_topic.clone(),
         imu: arguments.imu_topic.clone(),
-    };
-    Ok(Bag::read(bag)?.sensors(&topics, arguments.laser.map(Mount::upright))?)
+    }
 }
 
 /// Where the laser is, with a warning when that is a guess.
 fn mount(bag: &Path, log: &SensorLog) -> Mount {
     log.mount.unwrap_or_else(|| {
-        let typical = Mount::typical();
-        eprintln!(
-            "car-node: warning: {}: no /tf_static; laser assumed {} m ahead of base_link (--laser says otherwise)",
-            bag.display(),
-            typical.base_link_from_laser.x
-        );
-        typical
+        warn_of_guess(&bag.display().to_string());
+        Mount::typical()
     })
+}
+
+/// Says that nothing told where the laser is.
+fn warn_of_guess(source: &str) {
+    let ahead = Mount::typical().base_link_from_laser.x;
+    eprintln!(
+        "car-node: warning: {source}: no /tf_static; laser assumed {ahead} m ahead of base_link (--laser says otherwise)"
+    );
 }
 
 /// A parameter set, with a warning that lists the keys that mean nothing.

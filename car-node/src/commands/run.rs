@@ -6,8 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use car_node::frames::Mount;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::{BagPlayer, Race, Source};
+use car_node::source::{BagPlayer, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
 use maps::{OccupancyGrid, Raceline};
 use simulator::{CarSetup, Grip, OdometryParams, Track, YawSource};
@@ -25,9 +26,20 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             let mut log = super::read_bag(bag, &arguments.topics)?;
             log.mount = Some(super::mount(bag, &log));
             let player = BagPlayer::new(bag.clone(), log);
-            (map_of_bag(arguments)?, Box::new(player), Begin::Global)
+            (map_file(arguments)?, Box::new(player), Begin::Global)
         }
         (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
+        (SourceKind::Ros2, _) => {
+            if arguments.connect.is_empty() {
+                bail!(
+                    "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: what answers at that port \
+                     on the car is ROS, not a pit wall"
+                );
+            }
+            // The map first: its faults show without ROS.
+            let map = map_file(arguments)?;
+            (map, Box::new(ros2(arguments, &signal)?), Begin::Global)
+        }
         (SourceKind::Simulator, _) => {
             let track = Track::find(&arguments.map.to_string_lossy())?;
             let map = race_map(
@@ -79,6 +91,38 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Finds the live sensors, and says what it waits for.
+fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2> {
+    let domain = match (arguments.ros_domain, env::var("ROS_DOMAIN_ID")) {
+        (Some(domain), _) => domain,
+        (None, Ok(text)) if !text.is_empty() => text
+            .parse()
+            .with_context(|| format!("ROS_DOMAIN_ID={text} is not a domain"))?,
+        _ => 0,
+    };
+    let options = Ros2Options {
+        endpoint: arguments.ros.clone(),
+        domain,
+        topics: super::topics(&arguments.topics),
+        mount: arguments.topics.laser.map(Mount::upright),
+    };
+    let mut said = String::new();
+    let source = Ros2::find(&options, |missing| {
+        if missing != said {
+            missing.clone_into(&mut said);
+            eprintln!(
+                "{}: waiting for ROS 2 (domain {domain}): {missing}",
+                arguments.car
+            );
+        }
+        signal.try_recv().is_err()
+    })?;
+    if source.mount_is_a_guess() {
+        super::warn_of_guess("ROS 2");
+    }
+    Ok(source)
+}
+
 /// Waits for whatever ends the node first, and says what that was.
 fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static str {
     let mut ended = None;
@@ -119,7 +163,7 @@ fn signals() -> anyhow::Result<Receiver<&'static str>> {
     Ok(told)
 }
 
-fn map_of_bag(arguments: &Run) -> anyhow::Result<RaceMap> {
+fn map_file(arguments: &Run) -> anyhow::Result<RaceMap> {
     let grid = OccupancyGrid::load(&arguments.map)?;
     let beside = arguments.map.with_file_name("raceline.csv");
     let raceline = match &arguments.raceline {

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use maps::Pose;
 use synpf::{Stamp, Twist};
 
-use super::{Belief, Feed, Source};
+use super::{Belief, Feed, Next, Source};
 use crate::bag::SensorLog;
 use crate::clock::SensorClock;
 use crate::frames::Mount;
@@ -69,7 +69,9 @@ impl Source for BagPlayer {
         self.start
     }
 
-    fn next(&mut self, _: Option<Belief>) -> Option<(Stamp, Feed)> {
-        self.feeds.next()
+    fn next(&mut self, _: Option<Belief>) -> Next {
+        self.feeds
+            .next()
+            .map_or(Next::End, |(due, feed)| Next::Due(due, feed))
     }
 }

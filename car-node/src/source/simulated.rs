@@ -8,7 +8,7 @@ use maps::Pose;
 use simulator::{CarSetup, Estimate, Message, Output, Track, World};
 use synpf::{Odometry, Scan, Stamp, Twist, YawRate};
 
-use super::{Belief, Feed, Source};
+use super::{Belief, Feed, Next, Source};
 use crate::bag::SensorEvent;
 use crate::clock::{SensorClock, wall_now};
 use crate::frames::Mount;
@@ -133,7 +133,7 @@ impl Source for SimulatedCar {
         Some(shared.world.truth(self.car).pose)
     }
 
-    fn next(&mut self, belief: Option<Belief>) -> Option<(Stamp, Feed)> {
+    fn next(&mut self, belief: Option<Belief>) -> Next {
         let race = Arc::clone(&self.race);
         let mut shared = race.shared.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(belief) = belief {
@@ -149,7 +149,7 @@ impl Source for SimulatedCar {
             while let Some((due, feed)) = shared.queues[self.car].pop_front() {
                 let late = race.clock.get().map_or(0.0, |clock| clock.now().since(due));
                 if late < TOO_LATE {
-                    return Some((due, feed));
+                    return Next::Due(due, feed);
                 }
             }
             let now = shared.world.now();

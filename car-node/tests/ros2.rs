@@ -1,0 +1,332 @@
+//! A car whose sensors come off ROS 2: a simulated car that publishes as `rmw_zenoh` or a bridge does, and a node that
+//! finds its topics, localizes on them, and survives what is broken.
+
+use std::net::TcpListener;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use car_node::bag::{SensorEvent, Topics};
+use car_node::clock::wall_now;
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::ros::{self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3};
+use car_node::source::{Belief, Feed, Next, Race, Ros2, Ros2Error, Ros2Options, Source};
+use maps::Pose;
+use serde::Serialize;
+use simulator::{CarSetup, Track};
+use synpf::{Stamp, TrackMap};
+use zenoh::{Config, Session, Wait};
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig};
+
+const DEADLINE: Duration = Duration::from_mins(1);
+
+/// How the ROS side names its topics.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Naming {
+    RmwZenoh,
+    Bridge,
+}
+
+impl Naming {
+    fn key(self, topic: &str, dds_type: &str) -> String {
+        match self {
+            Self::RmwZenoh => format!("0/{topic}/{dds_type}/RIHS01_0123"),
+            Self::Bridge => topic.to_owned(),
+        }
+    }
+}
+
+/// A zenoh router with nothing around it, and its endpoint.
+fn router() -> (Session, String) {
+    // The port is free when this looks; another test taking it meanwhile would fail loudly.
+    let port = TcpListener::bind("127.0.0.1:0")
+        .and_then(|listener| listener.local_addr())
+        .expect("a free port")
+        .port();
+    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", r#""router""#.to_owned()),
+        ("listen/endpoints", format!("[{endpoint:?}]")),
+        ("scouting/multicast/enabled", "false".into()),
+        ("scouting/gossip/enabled", "false".into()),
+        // What a publisher keeps for those who come late needs stamps.
+        ("timestamping/enabled", "true".into()),
+    ] {
+        config.insert_json5(key, &value).expect("a setting");
+    }
+    (zenoh::open(config).wait().expect("a router"), endpoint)
+}
+
+/// The sensors of a simulated car, published as ROS does.
+struct RosCar {
+    router: Session,
+    naming: Naming,
+    _static_transforms: AdvancedPublisher<'static>,
+}
+
+impl RosCar {
+    fn new(router: &Session, naming: Naming, base_link_from_laser: Pose) -> Self {
+        let key = naming.key("tf_static", "tf2_msgs::msg::dds_::TFMessage_");
+        let transforms = router
+            .declare_publisher(key)
+            .cache(CacheConfig::default().max_samples(1))
+            .publisher_detection()
+            .wait()
+            .expect("a publisher");
+        let mount = TransformStamped {
+            header: header("base_link", wall_now()),
+            child_frame_id: "laser".into(),
+            transform: RosPose::from(base_link_from_laser),
+        };
+        transforms
+            .put(bytes(&TfMessage {
+                transforms: vec![mount],
+            }))
+            .wait()
+            .expect("published before anybody listens");
+        Self {
+            router: router.clone(),
+            naming,
+            _static_transforms: transforms,
+        }
+    }
+
+    fn publish(&self, topic: &str, dds_type: &str, payload: Vec<u8>) {
+        let key = self.naming.key(topic, dds_type);
+        self.router.put(key, payload).wait().expect("published");
+    }
+
+    fn tell(&self, event: &SensorEvent) {
+        match event {
+            SensorEvent::Scan(scan) => self.publish(
+                "scan",
+                "sensor_msgs::msg::dds_::LaserScan_",
+                bytes(&LaserScan {
+                    header: header("laser", scan.stamp),
+                    angle_min: scan.angle_min as f32,
+                    angle_increment: scan.angle_increment as f32,
+                    time_increment: scan.time_increment as f32,
+                    range_min: scan.range_min as f32,
+                    range_max: scan.range_max as f32,
+                    ranges: scan.ranges.clone(),
+                    ..LaserScan::default()
+                }),
+            ),
+            SensorEvent::Odometry(odometry) => self.publish(
+                "vesc/odom",
+                "nav_msgs::msg::dds_::Odometry_",
+                bytes(&RosOdometry {
+                    header: header("odom", odometry.stamp),
+                    child_frame_id: "base_link".into(),
+                    pose: RosPose::from(odometry.pose),
+                    linear: Vector3 {
+                        x: odometry.twist.linear_x,
+                        ..Vector3::default()
+                    },
+                    angular: Vector3 {
+                        z: odometry.twist.angular,
+                        ..Vector3::default()
+                    },
+                    ..RosOdometry::default()
+                }),
+            ),
+            SensorEvent::YawRate(_) => {}
+        }
+    }
+}
+
+fn header(frame: &str, stamp: Stamp) -> Header {
+    Header {
+        stamp: stamp.into(),
+        frame_id: frame.into(),
+    }
+}
+
+fn bytes<T: Serialize>(message: &T) -> Vec<u8> {
+    ros::encode(message).expect("encodes")
+}
+
+/// A drive in real time, published until it is told to stop; the driver steers by what the node believes.
+struct Drive {
+    stop: Arc<AtomicBool>,
+    thread: JoinHandle<()>,
+    belief: Arc<Mutex<Option<Belief>>>,
+    truth: Arc<Mutex<Vec<(Stamp, Pose)>>>,
+}
+
+fn drive(router: &Session, naming: Naming, track: &Track) -> (Drive, Pose) {
+    let race = Race::new(track.clone(), vec![CarSetup::default()], 1, Vec::new());
+    let mut car = race.car(0);
+    let start = car.start().expect("known");
+    let ros = RosCar::new(router, naming, car.mount().base_link_from_laser);
+    let stop = Arc::<AtomicBool>::default();
+    let belief = Arc::<Mutex<Option<Belief>>>::default();
+    let truth = Arc::<Mutex<Vec<(Stamp, Pose)>>>::default();
+    let thread = thread::spawn({
+        let (stop, belief, truth) = (Arc::clone(&stop), Arc::clone(&belief), Arc::clone(&truth));
+        let clock = car.clock(1.0);
+        move || {
+            while !stop.load(Ordering::Relaxed) {
+                let latest = *belief.lock().expect("sound");
+                let Next::Due(due, feed) = car.next(latest) else {
+                    panic!("a simulator always has something")
+                };
+                thread::sleep(clock.until(due));
+                match feed {
+                    Feed::Sensor(event) => ros.tell(&event),
+                    Feed::Truth(motion) => truth.lock().expect("sound").push((motion.stamp, motion.pose)),
+                    _ => {}
+                }
+            }
+        }
+    });
+    let drive = Drive {
+        stop,
+        thread,
+        belief,
+        truth,
+    };
+    (drive, start)
+}
+
+fn options(endpoint: &str) -> Ros2Options {
+    Ros2Options {
+        endpoint: endpoint.into(),
+        domain: 0,
+        topics: Topics::default(),
+        mount: None,
+    }
+}
+
+/// Localizes on a car's topics, breaks some messages on the way, and compares with the truth.
+fn localizes(naming: Naming) {
+    let (ros_router, ros_endpoint) = router();
+    let (_wall, wall_endpoint) = router();
+    let track = Track::find("club").expect("bundled");
+    let (drive, start) = drive(&ros_router, naming, &track);
+
+    let until = Instant::now() + DEADLINE;
+    let source = Ros2::find(&options(&ros_endpoint), |_| Instant::now() < until).expect("finds the sensors");
+    assert!(
+        !source.mount_is_a_guess(),
+        "the car told it before anybody listened"
+    );
+    assert!(
+        source.description().contains("/scan, /vesc/odom"),
+        "{}",
+        source.description()
+    );
+    let mount = source.mount().base_link_from_laser;
+    assert!(
+        (mount.x - CarSetup::default().lidar.base_link_from_laser.x).abs() < 1e-9,
+        "{mount:?}"
+    );
+
+    let map = RaceMap {
+        name: "club".into(),
+        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free")),
+        raceline: None,
+    };
+    let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
+    config.begin = Begin::Pose(start);
+    config.connect = vec![wall_endpoint];
+    let node = Node::start(config).expect("starts");
+    let mut compared = 0;
+    let mut moved: f64 = 0.0;
+    while compared < 200 {
+        assert!(Instant::now() < until, "{compared} beliefs compared");
+        thread::sleep(Duration::from_millis(5));
+        let Some(belief) = *node.shared().belief.lock().expect("sound") else {
+            continue;
+        };
+        *drive.belief.lock().expect("sound") = Some(belief);
+        let truth = drive.truth.lock().expect("sound");
+        let Some(pair) = truth
+            .windows(2)
+            .rev()
+            .find(|pair| pair[0].0 <= belief.stamp && belief.stamp < pair[1].0)
+        else {
+            continue;
+        };
+        let [(before, from), (after, to)] = [pair[0], pair[1]];
+        let true_pose = from.interpolate(to, belief.stamp.since(before) / after.since(before));
+        moved = moved.max(true_pose.distance(start));
+        let off = belief.pose.distance(true_pose);
+        assert!(off < 0.2, "{off} m off after {compared}");
+        compared += 1;
+        drop(truth);
+        if compared == 50 {
+            // Neither of these is a scan.
+            let key = naming.key("scan", "sensor_msgs::msg::dds_::LaserScan_");
+            ros_router
+                .put(&key, vec![0, 1, 0, 0, 9])
+                .wait()
+                .expect("published");
+            ros_router.put(&key, Vec::new()).wait().expect("published");
+        }
+    }
+    assert!(moved > 0.5, "the car has driven {moved} m");
+    drive.stop.store(true, Ordering::Relaxed);
+    drive.thread.join().expect("drives");
+    // A silent car ends as quickly as any other.
+    let begun = Instant::now();
+    node.shutdown("test over");
+    assert!(begun.elapsed() < Duration::from_secs(20));
+}
+
+#[test]
+fn a_node_localizes_on_a_car_that_speaks_rmw_zenoh() {
+    localizes(Naming::RmwZenoh);
+}
+
+#[test]
+fn a_node_localizes_on_a_car_behind_a_bridge() {
+    localizes(Naming::Bridge);
+}
+
+#[test]
+fn what_is_missing_is_named_while_waiting() {
+    let (ros_router, endpoint) = router();
+    let mut said = Vec::new();
+    let nobody = options("tcp/127.0.0.1:1");
+    let error = Ros2::find(&nobody, |missing| {
+        said.push(missing.to_owned());
+        false
+    })
+    .err();
+    assert!(matches!(error, Some(Ros2Error::Stopped { .. })), "{error:?}");
+    assert!(
+        said[0].contains("no zenoh router or bridge answers at tcp/127.0.0.1:1"),
+        "{said:?}"
+    );
+
+    said.clear();
+    let ros = RosCar::new(&ros_router, Naming::RmwZenoh, Pose::new(0.27, 0.0, 0.0));
+    let error = Ros2::find(&options(&endpoint), |missing| {
+        said.push(missing.to_owned());
+        // From now on there are scans, on a topic of another name, and still no odometry.
+        ros.publish(
+            "front/scan",
+            "sensor_msgs::msg::dds_::LaserScan_",
+            bytes(&LaserScan {
+                header: header("laser", wall_now()),
+                ranges: vec![1.0; 10],
+                ..LaserScan::default()
+            }),
+        );
+        said.len() < 4
+    })
+    .err();
+    assert!(matches!(error, Some(Ros2Error::Stopped { .. })), "{error:?}");
+    assert!(
+        said[0].contains("/scan (sensor_msgs/msg/LaserScan) and"),
+        "{said:?}"
+    );
+    let last = said.last().expect("several");
+    assert!(
+        !last.contains("LaserScan") && last.contains("/odom (nav_msgs/msg/Odometry)"),
+        "{said:?}"
+    );
+}

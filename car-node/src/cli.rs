@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use car_node::evaluate::{Fault, Start};
 use car_node::node::Begin;
+use car_node::ros_pose;
 use car_node::source::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
@@ -77,6 +78,9 @@ pub(crate) struct Run {
     /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
     #[arg(long, value_name = "N")]
     pub(crate) ros_domain: Option<u32>,
+    /// With --source ros2: where to publish the pose for the car's own nodes (nav_msgs/Odometry in frame map).
+    #[arg(long, value_name = "TOPIC", default_value = ros_pose::TOPIC)]
+    pub(crate) pose_topic: String,
     /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
     #[arg(long, value_name = "MAP.yaml|TRACK")]
     pub(crate) map: PathBuf,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
 use protocol::{CommandId, EventKind, Rates, SetRef};
-use synpf::{Hypothesis, Localizer, Odometry, Scan, Stamp, Tuning, Update, WeightedPose};
+use synpf::{Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, Tuning, Update, WeightedPose};
 
 use crate::bag::SensorEvent;
 use crate::clock::SensorClock;
@@ -158,6 +158,8 @@ pub struct Filter {
     pub shared: Arc<Shared>,
     /// What was taken, for a set in the shadow.
     pub tap: Tap,
+    /// Who on the car gets every belief of a car that knows where it is, such as its controller.
+    pub follower: Option<Sender<Belief>>,
 }
 
 /// What happens at its own pace, on the sensors' clock.
@@ -394,7 +396,7 @@ impl Loop {
                 pose,
                 twist: odometry.twist,
             };
-            self.believe(belief);
+            self.believe(belief, update.mode);
             if self.filter.predict && self.paces.pose.due(odometry.stamp, self.rates().pose) {
                 let estimate = self.estimate(belief, update, true);
                 self.filter.shared.outbox.pose(estimate);
@@ -432,7 +434,7 @@ impl Loop {
             pose: update.pose,
             twist: update.twist,
         };
-        self.believe(belief);
+        self.believe(belief, update.mode);
         self.count_laps(&update);
         let estimate = self.estimate(belief, &update, false);
         if rates.recorded {
@@ -467,7 +469,13 @@ impl Loop {
         Ok(())
     }
 
-    fn believe(&self, belief: Belief) {
+    fn believe(&self, belief: Belief, mode: Mode) {
+        // Who does not keep up misses some; the next one is better anyway.
+        if mode == Mode::Tracking
+            && let Some(follower) = &self.filter.follower
+        {
+            follower.try_send(belief).ok();
+        }
         *self
             .filter
             .shared

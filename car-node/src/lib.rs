@@ -19,6 +19,7 @@ pub mod proposal;
 pub mod publisher;
 pub mod race;
 pub mod ros;
+pub mod ros_pose;
 pub mod sets;
 pub mod shadow;
 pub mod source;

@@ -34,7 +34,7 @@ use crate::load;
 use crate::publisher::Publisher;
 use crate::sets::{self, NamedSet, SetError};
 use crate::shadow;
-use crate::source::{self, Source};
+use crate::source::{self, Belief, Source};
 use crate::throttle::Change;
 use crate::wire;
 
@@ -87,6 +87,8 @@ pub struct NodeConfig {
     pub thresholds: Thresholds,
     /// Folder for what survives a restart; None forgets.
     pub state: Option<PathBuf>,
+    /// Who on the car gets every belief as it is made, such as its controller.
+    pub follower: Option<Sender<Belief>>,
 }
 
 impl NodeConfig {
@@ -105,6 +107,7 @@ impl NodeConfig {
             predict: false,
             thresholds: Thresholds::default(),
             state: None,
+            follower: None,
         }
     }
 }
@@ -183,6 +186,7 @@ impl Node {
             predict,
             thresholds,
             state,
+            follower,
         } = config;
         if !(rate.is_finite() && rate > 0.0) {
             return Err(NodeError::Rate(rate));
@@ -253,6 +257,7 @@ impl Node {
                 predict,
                 shared: Arc::clone(&shared),
                 tap,
+                follower,
             },
             fed,
             ordered,

@@ -11,6 +11,7 @@ use car_node::bag::{SensorEvent, Topics};
 use car_node::clock::wall_now;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::ros::{self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3};
+use car_node::ros_pose;
 use car_node::source::{Belief, Feed, Next, Race, Ros2, Ros2Error, Ros2Options, Source};
 use maps::Pose;
 use serde::Serialize;
@@ -229,8 +230,23 @@ fn localizes(naming: Naming) {
         map: Arc::new(TrackMap::new(track.grid.clone()).expect("free")),
         raceline: None,
     };
+    let (follower, poses) = match source.ros_side() {
+        None => (None, None),
+        Some(side) => {
+            let poses = ros_router
+                .declare_subscriber("0/pf/pose/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0123")
+                .wait()
+                .expect("subscribes");
+            (
+                Some(ros_pose::start(side.clone(), ros_pose::TOPIC).expect("starts").0),
+                Some(poses),
+            )
+        }
+    };
+    assert_eq!(follower.is_some(), naming == Naming::RmwZenoh);
     let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
     config.begin = Begin::Pose(start);
+    config.follower = follower;
     config.connect = vec![wall_endpoint];
     let node = Node::start(config).expect("starts");
     let mut compared = 0;
@@ -268,6 +284,21 @@ fn localizes(naming: Naming) {
         }
     }
     assert!(moved > 0.5, "the car has driven {moved} m");
+    if let Some(poses) = poses {
+        // The controller gets what the filter believes, at odometry rate and with the stamps of the sensors.
+        let poses: Vec<RosOdometry> = poses
+            .drain()
+            .map(|sample| ros::decode(&sample.payload().to_bytes()).expect("a pose"))
+            .collect();
+        assert!(poses.len() > 50, "{}", poses.len());
+        let last = poses.last().expect("many");
+        assert_eq!(
+            (last.header.frame_id.as_str(), last.child_frame_id.as_str()),
+            ("map", "base_link")
+        );
+        assert!(wall_now().since(last.header.stamp.into()) < 5.0);
+        assert!(last.pose.planar().distance(start) > 0.5);
+    }
     drive.stop.store(true, Ordering::Relaxed);
     drive.thread.join().expect("drives");
     // A silent car ends as quickly as any other.

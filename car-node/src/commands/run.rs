@@ -5,11 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, anyhow, bail};
 use car_node::frames::Mount;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::{BagPlayer, Race, Ros2, Ros2Options, Source};
-use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
+use car_node::ros_pose;
+use car_node::source::{BagPlayer, Belief, Race, Ros2, Ros2Options, Source};
+use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
 use simulator::{CarSetup, Grip, OdometryParams, Track, YawSource};
 use synpf::TrackMap;
@@ -21,6 +22,7 @@ const LINGER: Duration = Duration::from_secs(1);
 
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let signal = signals()?;
+    let mut follower = None;
     let (map, source, begin): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
         (SourceKind::Bag, Some(bag)) => {
             let mut log = super::read_bag(bag, &arguments.topics)?;
@@ -38,7 +40,9 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             }
             // The map first: its faults show without ROS.
             let map = map_file(arguments)?;
-            (map, Box::new(ros2(arguments, &signal)?), Begin::Global)
+            let source = ros2(arguments, &signal)?;
+            follower = pose_for_ros(arguments, &source)?;
+            (map, Box::new(source), Begin::Global)
         }
         (SourceKind::Simulator, _) => {
             let track = Track::find(&arguments.map.to_string_lossy())?;
@@ -60,6 +64,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     config.connect.clone_from(&arguments.connect);
     config.rates.recorded = !arguments.no_recorded;
     config.predict = arguments.predict;
+    config.follower = follower;
     config.state = arguments
         .state
         .clone()
@@ -121,6 +126,20 @@ fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2
         super::warn_of_guess("ROS 2");
     }
     Ok(source)
+}
+
+/// Where the pose goes for the car's own nodes, unless they are behind a bridge.
+fn pose_for_ros(arguments: &Run, source: &Ros2) -> anyhow::Result<Option<Sender<Belief>>> {
+    let Some(side) = source.ros_side() else {
+        eprintln!(
+            "car-node: warning: behind a bridge the pose is not published to ROS ({}): it takes rmw_zenoh",
+            arguments.pose_topic
+        );
+        return Ok(None);
+    };
+    let (follower, _) = ros_pose::start(side.clone(), &arguments.pose_topic)
+        .map_err(|error| anyhow!("{}: cannot be published: {error}", arguments.pose_topic))?;
+    Ok(Some(follower))
 }
 
 /// Waits for whatever ends the node first, and says what that was.

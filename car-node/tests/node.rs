@@ -1,12 +1,14 @@
 //! A whole car on a simulated track, seen from the network: a router on loopback stands in for the pit wall.
 
-use std::net::TcpListener;
+mod common;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::source::Race;
+use common::router;
 use protocol::{
     Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message, Outcome,
     ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Shadow, Stamps, State, Topic, Value,
@@ -29,25 +31,8 @@ struct Wall {
 
 impl Wall {
     fn open() -> Self {
-        // The port is free when this looks; another test taking it meanwhile would fail loudly.
-        let port = TcpListener::bind("127.0.0.1:0")
-            .and_then(|listener| listener.local_addr())
-            .expect("a free port")
-            .port();
-        let endpoint = format!("tcp/127.0.0.1:{port}");
-        let mut config = Config::default();
-        for (key, value) in [
-            ("mode", r#""router""#.to_owned()),
-            ("listen/endpoints", format!("[{endpoint:?}]")),
-            ("scouting/multicast/enabled", "false".into()),
-            ("scouting/gossip/enabled", "false".into()),
-        ] {
-            config.insert_json5(key, &value).expect("a setting");
-        }
-        Self {
-            session: zenoh::open(config).wait().expect("a router"),
-            endpoint,
-        }
+        let (session, endpoint) = router();
+        Self { session, endpoint }
     }
 
     fn subscribe(&self, car: &CarName, topic: Topic) -> Subscriber<FifoChannelHandler<Sample>> {

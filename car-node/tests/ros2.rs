@@ -1,7 +1,8 @@
 //! A car whose sensors come off ROS 2: a simulated car that publishes as `rmw_zenoh` or a bridge does, and a node that
 //! finds its topics, localizes on them, and survives what is broken.
 
-use std::net::TcpListener;
+mod common;
+
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -13,11 +14,12 @@ use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::ros::{self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3};
 use car_node::ros_pose;
 use car_node::source::{Belief, Feed, Next, Race, Ros2, Ros2Error, Ros2Options, Source};
+use common::router;
 use maps::Pose;
 use serde::Serialize;
 use simulator::{CarSetup, Track};
 use synpf::{Stamp, TrackMap};
-use zenoh::{Config, Session, Wait};
+use zenoh::{Session, Wait};
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig};
 
 const DEADLINE: Duration = Duration::from_mins(1);
@@ -36,28 +38,6 @@ impl Naming {
             Self::Bridge => topic.to_owned(),
         }
     }
-}
-
-/// A zenoh router with nothing around it, and its endpoint.
-fn router() -> (Session, String) {
-    // The port is free when this looks; another test taking it meanwhile would fail loudly.
-    let port = TcpListener::bind("127.0.0.1:0")
-        .and_then(|listener| listener.local_addr())
-        .expect("a free port")
-        .port();
-    let endpoint = format!("tcp/127.0.0.1:{port}");
-    let mut config = Config::default();
-    for (key, value) in [
-        ("mode", r#""router""#.to_owned()),
-        ("listen/endpoints", format!("[{endpoint:?}]")),
-        ("scouting/multicast/enabled", "false".into()),
-        ("scouting/gossip/enabled", "false".into()),
-        // What a publisher keeps for those who come late needs stamps.
-        ("timestamping/enabled", "true".into()),
-    ] {
-        config.insert_json5(key, &value).expect("a setting");
-    }
-    (zenoh::open(config).wait().expect("a router"), endpoint)
 }
 
 /// The sensors of a simulated car, published as ROS does.

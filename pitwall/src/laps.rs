@@ -272,36 +272,22 @@ mod tests {
         assert!(book.laps()[0].sectors_s.iter().all(Option::is_some));
     }
 
+    /// In the first lap, on the line.
+    fn passed(at: i64, s: f64) -> Passed {
+        Passed {
+            at,
+            s,
+            d: 0.0,
+            lap: 1,
+        }
+    }
+
     #[test]
     fn a_jump_passes_no_border() {
         let mut book = LapBook::default();
-        book.on_pose(
-            Passed {
-                at: 0,
-                s: 5.0,
-                d: 0.0,
-                lap: 1,
-            },
-            LENGTH,
-        );
-        book.on_pose(
-            Passed {
-                at: 25_000_000,
-                s: 15.0,
-                d: 0.0,
-                lap: 1,
-            },
-            LENGTH,
-        );
-        book.on_pose(
-            Passed {
-                at: 9_000_000_000,
-                s: 16.0,
-                d: 0.0,
-                lap: 1,
-            },
-            LENGTH,
-        );
+        book.on_pose(passed(0, 5.0), LENGTH);
+        book.on_pose(passed(25_000_000, 15.0), LENGTH);
+        book.on_pose(passed(9_000_000_000, 16.0), LENGTH);
         book.on_lap(1, 9.0, "lq");
         assert_eq!(book.laps()[0].sectors_s, [None; SECTORS]);
     }
@@ -309,15 +295,7 @@ mod tests {
     #[test]
     fn slip_is_told_as_a_share_of_the_lap() {
         let mut book = LapBook::default();
-        book.on_pose(
-            Passed {
-                at: 0,
-                s: 5.0,
-                d: 0.0,
-                lap: 1,
-            },
-            LENGTH,
-        );
+        book.on_pose(passed(0, 5.0), LENGTH);
         for slip in [0.0, 0.05, -0.3, 0.1] {
             let alignment = 0.8;
             book.on_metrics(&Metrics {

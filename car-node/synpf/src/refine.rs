@@ -272,11 +272,20 @@ mod tests {
             .collect()
     }
 
-    fn wide(pose: Pose) -> Estimate {
-        Estimate {
-            pose,
+    /// Fitted from a start that is 0.2 m and 0.1 rad unsure.
+    fn fitted(field: &DistanceField, points: &[[f32; 2]], start: Pose) -> Estimate {
+        let prior = Estimate {
+            pose: start,
             covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
-        }
+        };
+        refine(
+            field,
+            points,
+            start,
+            &prior,
+            0.0,
+            &RefinementParameters::default(),
+        )
     }
 
     #[test]
@@ -284,14 +293,7 @@ mod tests {
         let field = room(false);
         let truth = Pose::new(4.0, 2.0, 0.4);
         let start = Pose::new(4.1, 1.92, 0.45);
-        let found = refine(
-            &field,
-            &scan(&field, truth),
-            start,
-            &wide(start),
-            0.0,
-            &RefinementParameters::default(),
-        );
+        let found = fitted(&field, &scan(&field, truth), start);
         assert!(found.pose.distance(truth) < 0.002, "{found:?}");
         assert!((found.pose.heading - truth.heading).abs() < 5e-4);
         assert!(found.covariance[(0, 0)].sqrt() < 0.02);
@@ -306,14 +308,7 @@ mod tests {
             *point = point.map(|v| v * 0.5);
         }
         let start = Pose::new(4.03, 1.98, 0.41);
-        let found = refine(
-            &field,
-            &points,
-            start,
-            &wide(start),
-            0.0,
-            &RefinementParameters::default(),
-        );
+        let found = fitted(&field, &points, start);
         assert!(found.pose.distance(truth) < 0.01, "{found:?}");
     }
 
@@ -322,14 +317,7 @@ mod tests {
         let field = room(true);
         let truth = Pose::new(25.0, 2.0, 0.0);
         let start = Pose::new(25.1, 2.05, 0.02);
-        let found = refine(
-            &field,
-            &scan(&field, truth),
-            start,
-            &wide(start),
-            0.0,
-            &RefinementParameters::default(),
-        );
+        let found = fitted(&field, &scan(&field, truth), start);
         assert!(
             (found.pose.y - 2.0).abs() < 0.002 && found.pose.heading.abs() < 1e-3,
             "{found:?}"
@@ -345,14 +333,7 @@ mod tests {
     #[test]
     fn no_points_leave_the_prior() {
         let start = Pose::new(4.0, 2.0, 0.4);
-        let found = refine(
-            &room(false),
-            &[],
-            start,
-            &wide(start),
-            0.0,
-            &RefinementParameters::default(),
-        );
+        let found = fitted(&room(false), &[], start);
         assert!(found.pose.distance(start) < 1e-9);
     }
 }

@@ -66,11 +66,21 @@ impl Board {
         taps.retain(|tap| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))));
     }
 
-    /// Puts `fleet` in place of what was known: a replay has jumped.
-    pub fn restart(&self, fleet: Fleet) {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        state.fleet = fleet;
-        state.epoch += 1;
+    /// Puts `fleet` in place of what was known: a replay has jumped to `at` [unix ns]. Taps are told what a newcomer
+    /// needs to know: they have not seen what lies between.
+    pub fn restart(&self, fleet: Fleet, at: i64) {
+        {
+            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+            state.fleet = fleet;
+            state.epoch += 1;
+        }
+        let events: Vec<_> = self.known(at).into_iter().map(Arc::new).collect();
+        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
+        taps.retain(|tap| {
+            events
+                .iter()
+                .all(|event| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))))
+        });
     }
 
     /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
@@ -126,5 +136,26 @@ impl Board {
             }
         }
         events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn after_a_jump_a_tap_knows_the_cars() {
+        let board = Board::default();
+        let events = board.tap(0);
+        assert!(events.is_empty());
+        let mut fleet = Fleet::default();
+        fleet.apply(&FleetEvent {
+            at: 1,
+            car: "car-1".parse().expect("a name"),
+            happening: Happening::Appeared,
+        });
+        board.restart(fleet, 5);
+        let event = events.try_recv().expect("what a newcomer needs to know");
+        assert_eq!((event.at, event.car.as_str()), (5, "car-1"));
     }
 }

@@ -209,7 +209,7 @@ impl Replay {
             fleet.apply(&event);
         }
         fleet.tick(to);
-        self.board.restart(fleet);
+        self.board.restart(fleet, to);
         Ok(events)
     }
 }

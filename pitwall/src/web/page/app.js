@@ -276,6 +276,7 @@ async function rerun() {
     viewer.src = "about:blank";
   }
   viewer.hidden = !on;
+  document.querySelector("main").classList.toggle("deep", on);
   press($("rerun"), on);
 }
 

@@ -39,6 +39,9 @@ export const element = (tag, className, text) => {
 
 export const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 
+/// Milliseconds, with a digit behind the point where there is room.
+const ms = (value) => fixed(value, value < 100 ? 1 : 0, " ms");
+
 /// How old the pose is.
 const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed(pose && pose.age_s * 1e3, 0, " ms"));
 
@@ -53,8 +56,8 @@ export const FACTS = [
   ["last lap", (c) => fixed(c.last_lap_s, 2, " s"), null, "the last lap"],
   ["best lap", (c) => fixed(c.best_lap_s, 2, " s"), null, "the best lap"],
   ["poses", (c) => fixed(c.streams.pose?.rate_hz, 0, " /s"), null, "poses that arrive"],
-  ["round trip", (c) => fixed(c.round_trip_s && c.round_trip_s * 1e3, 1, " ms"), (c) => c.round_trip_s > 0.1, "to the car and back"],
-  ["update p99", (c) => fixed(c.load && c.load.update_us.p99 / 1e3, 1, " ms"), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
+  ["round trip", (c) => ms(c.round_trip_s && c.round_trip_s * 1e3), (c) => c.round_trip_s > 0.1, "to the car and back"],
+  ["update p99", (c) => ms(c.load && c.load.update_us.p99 / 1e3), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
   ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
   ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – where the machine does not tell"],
   ["missing", (c) => String(missing(c)), null, "messages that were sent and did not arrive"],

@@ -1,8 +1,8 @@
 //! What twenty cars at full rate cost the pit wall, and how fast and how fresh its page is then.
 //!
 //! ```text
-//! cargo build --release -p pitwall --no-default-features
-//! cargo run --release -p system-tests --features browser --bin page-load -- --pitwall target/release/pitwall
+//! cargo build --release -p pitwall -p system-tests --features system-tests/browser
+//! target/release/page-load --pitwall target/release/pitwall
 //! ```
 //!
 //! Starts the program given, cars in a process of their own, and a headless Chromium that draws in software; then

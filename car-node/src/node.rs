@@ -510,7 +510,10 @@ fn answer_clock(query: &Query, session_number: u64, shared: &Shared) {
         .payload()
         .and_then(|payload| decode::<ClockRequest>(&payload.to_bytes()).ok());
     let Some((_, request)) = request else {
-        shared.counters.bad_payload();
+        let count = shared.counters.bad_payload() + 1;
+        if count.is_power_of_two() {
+            tracing::warn!(topic = %Topic::Clock, count, "a question for the clock cannot be read");
+        }
         return;
     };
     let reply = ClockReply {

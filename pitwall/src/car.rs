@@ -279,6 +279,7 @@ impl Car {
             load: self.load.clone(),
             round_trip_s: self.clock.map(|clock| seconds(clock.round_trip)),
             clock_offset_s: self.clock.map(|clock| seconds(clock.offset)),
+            clock_uncertainty_s: self.clock.map(|clock| 0.5 * seconds(clock.round_trip)),
             streams: self
                 .streams
                 .iter()
@@ -320,8 +321,10 @@ pub struct CarView {
     pub load: Option<Load>,
     /// Round-trip time to the car [s].
     pub round_trip_s: Option<f64>,
-    /// How far the car's clock is ahead of this one; right to within half the round-trip time [s].
+    /// How far the car's clock is ahead of this one [s].
     pub clock_offset_s: Option<f64>,
+    /// How far that may be off: half the round-trip time, all of which may have been spent one way [s].
+    pub clock_uncertainty_s: Option<f64>,
     /// Every stream by topic.
     pub streams: BTreeMap<&'static str, StreamView>,
     /// The last lap [s].

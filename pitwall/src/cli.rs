@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
-use protocol::{CarName, Pose2};
+use protocol::{CarName, Pose2, Rates};
 
 /// The pit wall: how well every car is localized and why. Without a command it serves the page.
 #[derive(Debug, Parser)]
@@ -263,16 +263,16 @@ pub(crate) struct Place {
 #[derive(Debug, Args)]
 pub(crate) struct RateOptions {
     /// Poses per second.
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = rate, allow_negative_numbers = true)]
     pub(crate) pose: Option<f32>,
     /// Particle clouds per second.
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = rate, allow_negative_numbers = true)]
     pub(crate) cloud: Option<f32>,
     /// Scan views per second.
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = rate, allow_negative_numbers = true)]
     pub(crate) scan: Option<f32>,
     /// Health messages per second.
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = rate, allow_negative_numbers = true)]
     pub(crate) health: Option<f32>,
     /// Send the full-rate streams for the recorder: on or off.
     #[arg(long, value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
@@ -302,6 +302,15 @@ fn on_off(text: &str) -> Result<bool, String> {
         "on" => Ok(true),
         "off" => Ok(false),
         _ => Err("say on or off".to_owned()),
+    }
+}
+
+fn rate(text: &str) -> Result<f32, String> {
+    let rate: f32 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    if (0.0..=Rates::MAX).contains(&rate) {
+        Ok(rate)
+    } else {
+        Err(format!("a rate is 0 to {} Hz", Rates::MAX))
     }
 }
 
@@ -335,6 +344,14 @@ mod tests {
         assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
         for text in ["", "s", "-1s", "1y", "NaN"] {
             assert!(duration(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_rate_is_what_a_car_can_send() {
+        assert_eq!(rate("12.5"), Ok(12.5));
+        for text in ["-1", "NaN", "inf", "1001", "fast"] {
+            assert!(rate(text).is_err(), "{text}");
         }
     }
 

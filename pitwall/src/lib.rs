@@ -7,9 +7,15 @@
 //!
 //! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Link`] is the
 //! only way to the network.
+
+// The terminal's verbs name the library as anybody else would.
+extern crate self as pitwall;
+
 mod ask;
 mod board;
 mod car;
+mod cli;
+mod commands;
 mod event;
 mod fleet;
 mod gaps;
@@ -18,6 +24,8 @@ mod hub;
 mod laps;
 mod link;
 mod log;
+mod output;
+mod program;
 mod recording;
 mod replay;
 mod report;
@@ -38,6 +46,7 @@ pub use hub::{Hub, StartError};
 pub use laps::{Lap, LapGrip, SECTORS};
 pub use link::{DEFAULT_LISTEN, LOCAL_WALL, Link, LinkError, Role, Sink, unix_now};
 pub use log::{Log, LogEntry};
+pub use program::program;
 pub use recording::{
     Progress, Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events,
     recover,

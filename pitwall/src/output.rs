@@ -147,14 +147,16 @@ pub(crate) fn card(car: &CarView) -> String {
     }
     let rate = |topic: &str| car.streams.get(topic).map_or(0.0, |stream| stream.rate_hz);
     let missing: u64 = car.streams.values().map(|stream| stream.missing).sum();
+    let recovered: u64 = car.streams.values().map(|stream| stream.filled_late).sum();
     lines.push(format!(
-        "link    pose {:.1}/s  cloud {:.1}/s  health {:.1}/s  age {} ms  RTT {} ms  clock {} ms  missing {missing}",
+        "link    pose {:.1}/s  cloud {:.1}/s  health {:.1}/s  age {} ms  RTT {} ms  clock {} +/- {} ms  missing {missing}  recovered {recovered}",
         rate("pose"),
         rate("cloud"),
         rate("health"),
         number(car.pose.as_ref().map(|pose| pose.age_s * 1e3), 0),
         number(car.round_trip_s.map(|s| s * 1e3), 1),
         number(car.clock_offset_s.map(|s| s * 1e3), 1),
+        number(car.clock_uncertainty_s.map(|s| s * 1e3), 1),
     ));
     lines.join("\n")
 }

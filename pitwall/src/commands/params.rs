@@ -16,6 +16,9 @@ use super::{FIND, no_such_car, open};
 use crate::cli::{Expect, LinkOptions, ParamsVerb};
 use crate::output;
 
+/// Exit code: the car does not do that.
+const REFUSED: u8 = 3;
+
 /// Exit code: no answer in time.
 const NO_ANSWER: u8 = 5;
 
@@ -244,13 +247,17 @@ async fn list(
         }
         return Ok(ExitCode::SUCCESS);
     };
-    let find = |name: &str| {
-        let stored = sets.iter().find(|stored| stored.set.name == name);
-        stored
-            .map(|stored| &stored.set)
-            .with_context(|| format!("no set {name} on {car}"))
+    let find = |name: &str| sets.iter().map(|stored| &stored.set).find(|set| set.name == name);
+    let (Some(of_a), Some(of_b)) = (find(&a), find(&b)) else {
+        let unknown = if find(&a).is_none() { &a } else { &b };
+        let known: Vec<_> = sets.iter().map(|stored| stored.set.name.as_str()).collect();
+        output::complain(&format!(
+            "{car}: no set {unknown}; there are {}",
+            known.join(", ")
+        ));
+        return Ok(ExitCode::from(REFUSED));
     };
-    let differences = differences(find(&a)?, find(&b)?);
+    let differences = differences(of_a, of_b);
     if json {
         output::say_json(&differences)?;
     } else if differences.is_empty() {

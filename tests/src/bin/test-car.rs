@@ -1,10 +1,12 @@
 //! Cars in a process of their own, so that a test can kill one as a power cut does.
 //!
 //! ```text
-//! test-car race NAME START ENDPOINT     a real node in a simulated car on the bundled track
-//! test-car rings COUNT ENDPOINT         cars made of nothing but protocol, car-1 to car-COUNT, at full rate
+//! test-car race NAME START ENDPOINT [STATE]   a real node in a simulated car on the bundled track; STATE is the folder
+//!                                             that its sets are kept in
+//! test-car rings COUNT ENDPOINT               cars made of nothing but protocol, car-1 to car-COUNT, at full rate
 //! ```
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -23,14 +25,20 @@ fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match arguments[..] {
-        ["race", name, start, endpoint] => race(name, start.parse().context("START")?, endpoint),
+        ["race", name, start, endpoint] => race(name, start.parse().context("START")?, endpoint, None),
+        ["race", name, start, endpoint, state] => race(
+            name,
+            start.parse().context("START")?,
+            endpoint,
+            Some(state.into()),
+        ),
         ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint),
-        _ => bail!("usage: test-car race NAME START ENDPOINT | rings COUNT ENDPOINT"),
+        _ => bail!("usage: test-car race NAME START ENDPOINT [STATE] | rings COUNT ENDPOINT"),
     }
 }
 
 /// A car that starts at `start` [m] along the raceline.
-fn race(name: &str, start: f64, endpoint: &str) -> anyhow::Result<()> {
+fn race(name: &str, start: f64, endpoint: &str, state: Option<PathBuf>) -> anyhow::Result<()> {
     let track = Track::find("club")?;
     let map = RaceMap {
         name: track.name.clone(),
@@ -45,6 +53,7 @@ fn race(name: &str, start: f64, endpoint: &str) -> anyhow::Result<()> {
     let mut config = NodeConfig::new(CarName::new(name)?, map, Box::new(race.car(0)));
     config.begin = Begin::Source;
     config.connect = vec![endpoint.to_owned()];
+    config.state = state;
     let node = Node::start(config)?;
     std::thread::sleep(LONGEST);
     node.shutdown("the test is over");

@@ -170,10 +170,11 @@ export function showNumbers(table, car, pace) {
       add("queue", String(car.load.queue_depth));
       for (const [name, count] of Object.entries(car.load.drops)) if (count) add(`dropped: ${name.replaceAll("_", " ")}`, String(count));
     }
-    add("clock offset", fixed(car.clock_offset_s && car.clock_offset_s * 1e3, 2, " ms"));
+    const ms = (s) => fixed(s && s * 1e3, 2);
+    add("clock offset", car.clock_offset_s == null ? "-" : `${ms(car.clock_offset_s)} ± ${ms(car.clock_uncertainty_s)} ms`);
     add("missing", String(missing(car)));
     for (const [topic, s] of Object.entries(car.streams)) {
-      add(topic, `${fixed(s.rate_hz, 1)} /s, missing ${s.missing}${s.filled_late ? `, late ${s.filled_late}` : ""}${s.unreadable ? `, unreadable ${s.unreadable}` : ""}`);
+      add(topic, `${fixed(s.rate_hz, 1)} /s, age ${fixed(s.age_s, 2)} s, missing ${s.missing}${s.filled_late ? `, recovered ${s.filled_late}` : ""}${s.unreadable ? `, unreadable ${s.unreadable}` : ""}`);
     }
     if (car.info) {
       add("source", car.info.source);

@@ -1,0 +1,218 @@
+//! Bytes that are no message, on every key and both ways: refused, counted, said once, and neither side minds.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::source::Race;
+use pitwall::Hub;
+use protocol::{
+    Action, CarName, Command, CommandId, Key, LinkReport, Message, ParamsAction, Stamps, Topic, encode,
+};
+use simulator::{CarSetup, Track};
+use synpf::TrackMap;
+use system_tests::{free_endpoint, router, wait_until};
+use zenoh::qos::CongestionControl;
+
+fn start(name: &CarName, endpoint: &str) -> Node {
+    let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
+    let track = Track::load(tracks.join("club")).expect("bundled");
+    let map = RaceMap {
+        name: track.name.clone(),
+        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
+        raceline: Some(Arc::new(track.raceline.clone())),
+    };
+    let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
+    let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
+    config.begin = Begin::Source;
+    config.connect = vec![endpoint.to_owned()];
+    Node::start(config).expect("a car")
+}
+
+/// A program that belongs to nobody.
+async fn stranger(endpoint: &str) -> zenoh::Session {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", r#""client""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        config.insert_json5(key, &value).expect("a good setting");
+    }
+    zenoh::open(config).await.expect("a session")
+}
+
+/// Random bytes that are the same in every run (xorshift, Marsaglia 2003).
+fn random(length: usize, mut state: u64) -> Vec<u8> {
+    std::iter::repeat_with(|| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 32) as u8
+    })
+    .take(length)
+    .collect()
+}
+
+/// None of these is a message of any topic.
+fn garbage() -> Vec<Vec<u8>> {
+    let stamps = Stamps::default();
+    let command = Command {
+        id: CommandId(1),
+        operator: "stranger".into(),
+        expected_revision: None,
+        action: Action::Params(ParamsAction::Select {
+            name: "lq".into(),
+            revert_after_ms: None,
+        }),
+    };
+    let command = encode(&command, stamps).expect("a good message");
+    let report = LinkReport {
+        transit: 0.1,
+        uncertainty: 0.001,
+        poses: 40,
+    };
+    let report = encode(&report, stamps).expect("a good message");
+    let mut garbage = vec![
+        Vec::new(),
+        vec![0],
+        b"SYPF".to_vec(),
+        vec![0xff; 39],
+        vec![0xff; 40],
+    ];
+    // Cut off within the header, at its end, and within the payload; and with something behind.
+    for message in [&command, &report] {
+        garbage.extend([1, 20, 40, message.len() - 1].map(|length| message[..length].to_vec()));
+        garbage.push([&message[..], &[0]].concat());
+    }
+    // A good header with nonsense behind it, and what no message is as long as.
+    garbage.push([&command[..40], &random(200, 7)].concat());
+    garbage.push([&report[..40], &vec![0; Command::MAX_LEN + 1]].concat());
+    garbage.push(vec![0; 2 << 20]);
+    garbage.extend((1..6).map(|seed| random(50 * seed as usize, seed)));
+    garbage
+}
+
+/// What a car is asked or told.
+const ASKED: [Topic; 7] = [
+    Topic::Clock,
+    Topic::Link,
+    Topic::CmdParams,
+    Topic::CmdPose,
+    Topic::CmdRelocalize,
+    Topic::CmdRates,
+    Topic::CmdAuto,
+];
+
+/// What a pit wall listens to.
+const HEARD: [Topic; 11] = [
+    Topic::Pose,
+    Topic::Cloud,
+    Topic::Scan,
+    Topic::Health,
+    Topic::Load,
+    Topic::Params,
+    Topic::Event,
+    Topic::Shadow,
+    Topic::RecordedPose,
+    Topic::RecordedOdometry,
+    Topic::RecordedScan,
+];
+
+#[tokio::test(flavor = "multi_thread")]
+async fn garbage_on_every_key_is_refused_counted_and_said_once() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    hub.link().subscribe_recorded(true).await.expect("subscribed");
+    let car = CarName::new("car-1").expect("a good name");
+    let node = start(&car, &endpoint);
+    let updates = || {
+        hub.fleet()
+            .car(&car)
+            .and_then(|car| car.pose)
+            .map_or(0, |(_, pose)| pose.update)
+    };
+    assert!(
+        hub.wait_until(Duration::from_secs(90), |fleet| {
+            fleet
+                .car(&car)
+                .is_some_and(|car| car.params.is_some() && car.pose.is_some())
+        })
+        .await
+    );
+    let revision = || {
+        hub.fleet()
+            .car(&car)
+            .and_then(|car| Some(car.params.as_ref()?.revision))
+    };
+    let before = revision();
+    let stranger = stranger(&endpoint).await;
+    let garbage = garbage();
+    for topic in Topic::all() {
+        let key = Key::new(car.clone(), topic).to_string();
+        for bytes in &garbage {
+            // What a full queue drops on its way is not refused by anybody.
+            let sent = stranger.put(&key, bytes.clone());
+            sent.congestion_control(CongestionControl::Block)
+                .await
+                .expect("sent");
+            let replies = stranger
+                .get(&key)
+                .payload(bytes.clone())
+                .timeout(Duration::from_secs(5))
+                .await
+                .expect("sent");
+            // One after the other: a full desk would not even look.
+            while let Ok(reply) = replies.recv_async().await {
+                assert!(
+                    reply.result().is_err() || matches!(topic, Topic::Map | Topic::Info),
+                    "{topic} answered to {} bytes",
+                    bytes.len()
+                );
+            }
+        }
+    }
+    // What the car is asked or told is counted on the car, and it says so with its load.
+    let expected = (ASKED.len() * garbage.len()) as u64;
+    let counted = || {
+        let fleet = hub.fleet();
+        fleet
+            .car(&car)
+            .and_then(|car| Some(car.load.as_ref()?.drops.payloads))
+    };
+    wait_until("every one of them is counted", || counted() >= Some(expected)).await;
+    assert_eq!(counted(), Some(expected));
+    // What the pit wall listens to is counted there, and stands in the log once.
+    for topic in HEARD {
+        wait_until(topic.as_str(), || {
+            let views = hub.fleet().view(pitwall::unix_now());
+            let unreadable = views[0]
+                .streams
+                .get(topic.as_str())
+                .map(|stream| stream.unreadable);
+            unreadable >= Some(garbage.len() as u64)
+        })
+        .await;
+        let word = format!("{topic} cannot be read");
+        let fleet = hub.fleet();
+        let said = fleet
+            .log()
+            .since(0)
+            .filter(|entry| entry.text.starts_with(&word))
+            .count();
+        assert_eq!(said, 1, "{topic}");
+    }
+    // The car drives on, on the set that it had, and takes commands.
+    let last = updates();
+    wait_until("the car drives on", || updates() > last + 40).await;
+    assert_eq!(revision(), before);
+    let verdict = hub
+        .link()
+        .command(&car, "ana", None, Action::Params(ParamsAction::List))
+        .await
+        .expect("a good command");
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+    node.shutdown("test over");
+    hub.close().await;
+}

@@ -325,6 +325,43 @@ mod tests {
     }
 
     #[test]
+    fn a_wall_that_is_grazed_gets_lost() {
+        // A corridor 2 m wide: its wall returns where it is met at 20 degrees, 3 m away, and not at 3 degrees, 19 m away.
+        let points = vec![
+            [-29.0, -1.0],
+            [29.0, -1.0],
+            [29.0, 1.0],
+            [-29.0, 1.0],
+            [-29.0, -1.0],
+        ];
+        let walls = Walls::new(vec![Wall {
+            surface: Surface::Plain,
+            points,
+        }]);
+        let lossless = scan(perfect(), &walls, &[], 0.0);
+        let real = scan(LidarParams::default(), &walls, &[], 0.0);
+        let lost = |scan: &Scan, degrees: usize| {
+            let middle = 540 + 4 * degrees;
+            let beams = &scan.ranges[middle - 4..=middle + 4];
+            beams.iter().filter(|range| range.is_infinite()).count()
+        };
+        assert_eq!([20, 3].map(|degrees| lost(&lossless, degrees)), [0, 0]);
+        assert!(lost(&real, 20) <= 1 && lost(&real, 3) >= 7);
+    }
+
+    #[test]
+    fn as_many_beams_drop_out_as_promised() {
+        let params = LidarParams {
+            dropout: 0.1,
+            ..perfect()
+        };
+        let scan = scan(params, &room(Surface::Plain), &[], 0.0);
+        let lost = scan.ranges.iter().filter(|range| range.is_infinite()).count();
+        // 108 of 1081 with a standard deviation of 10; three are allowed.
+        assert!((78..139).contains(&lost), "{lost}");
+    }
+
+    #[test]
     fn another_car_stands_in_view() {
         let other = Obstacle {
             map_from_centre: Pose::new(1.5, 0.0, 1.0),

@@ -513,6 +513,77 @@ mod tests {
     }
 
     #[test]
+    fn a_step_of_the_steering_answers_as_the_linear_single_track_model_does() {
+        // The yaw rate's step response in closed form (Rajamani, section 2.3; Riekert and Schunck, 1940), on tyres and a
+        // servo with next to no lag of their own; what is left of it shifts the time.
+        let (speed, steering, lag) = (6.0, 0.004, 0.01 / 6.0 + 1.0 / 400.0);
+        let mut params = VehicleParams {
+            steering_gain: 400.0,
+            steering_rate: 1000.0,
+            ..VehicleParams::default()
+        };
+        params.front_tires.relaxation_length = 0.01;
+        params.rear_tires.relaxation_length = 0.01;
+        let mut vehicle = settled(&params, speed, 0.0);
+
+        let v = vehicle.state().vx;
+        let (m, inertia, a, b) = (
+            params.mass,
+            params.yaw_inertia,
+            params.front_axle,
+            params.rear_axle,
+        );
+        let [front, rear] = params.static_loads();
+        let (front, rear) = (
+            params.front_tires.linear_stiffness(front),
+            params.rear_tires.linear_stiffness(rear),
+        );
+        let decay = f64::midpoint(
+            (front + rear) / (m * v),
+            (a * a * front + b * b * rear) / (inertia * v),
+        );
+        let natural =
+            front * rear * (a + b).powi(2) / (m * inertia * v * v) + (b * rear - a * front) / inertia;
+        let ringing = (natural - decay * decay).sqrt();
+        let settles_at = v * steering / (params.wheelbase() + params.understeer_gradient() * v * v);
+        let begins_with = a * front * steering / inertia;
+        let expected = |t: f64| {
+            let sine = (begins_with - decay * settles_at) / ringing;
+            let (sin, cos) = (ringing * t).sin_cos();
+            settles_at + (-decay * t).exp() * (sine * sin - settles_at * cos)
+        };
+        for i in 1..100 {
+            vehicle.drive(Controls { speed, steering }, STEP);
+            let t = f64::from(i) * STEP - lag;
+            if t > 2.0 * lag {
+                let off = vehicle.state().yaw_rate - expected(t);
+                assert!(
+                    off.abs() < 0.03 * settles_at,
+                    "after {t} s: {off} of {settles_at} rad/s"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn the_servo_turns_no_faster_and_no_further_than_it_can() {
+        let params = VehicleParams::default();
+        let mut vehicle = Vehicle::at_rest(params, Pose::IDENTITY);
+        let all = Controls {
+            speed: 0.0,
+            steering: 1.0,
+        };
+        vehicle.drive(all, 0.05);
+        let turned = vehicle.state().steering;
+        assert!(
+            (turned / (0.05 * params.steering_rate) - 1.0).abs() < 0.02,
+            "{turned}"
+        );
+        vehicle.drive(all, 1.0);
+        assert!((vehicle.state().steering - params.max_steering).abs() < 1e-6);
+    }
+
+    #[test]
     fn the_car_understeers() {
         assert!(VehicleParams::default().understeer_gradient() > 0.0);
     }

@@ -623,6 +623,44 @@ mod tests {
     }
 
     #[test]
+    fn sensors_arrive_as_late_as_on_a_real_car() {
+        let mut world = World::new(ring(), &[CarSetup::default()], 3);
+        let ms = Duration::from_millis;
+        let (mut scans, mut odometry) = (0, 0);
+        while world.now() < Duration::from_secs(2) {
+            let before = world.now();
+            for output in world.step() {
+                assert!(before < output.at && output.at <= world.now());
+                // Real cars log a scan 17 to 22 ms after its stamp.
+                match output.message {
+                    Message::Scan(scan) => {
+                        assert!((ms(17)..ms(22)).contains(&(output.at.saturating_sub(scan.stamp))));
+                        scans += 1;
+                    }
+                    Message::Odometry(message) => {
+                        assert_eq!(output.at.saturating_sub(message.stamp), ms(1));
+                        odometry += 1;
+                    }
+                    _ => {}
+                }
+            }
+        }
+        assert!((78..=80).contains(&scans) && (99..=100).contains(&odometry));
+    }
+
+    #[test]
+    fn a_command_takes_effect_after_the_driver_s_delay() {
+        let mut world = cars(&[0.0], &[1.0]);
+        let delay = world.cars[0].driver.params().delay;
+        while world.now() < delay {
+            world.step();
+            assert_eq!(world.cars[0].controls, Controls::default());
+        }
+        world.step();
+        assert!(world.cars[0].controls.speed > 0.0);
+    }
+
+    #[test]
     fn boxes_overlap_where_they_do() {
         let at = |x: f64, heading: f64| Obstacle {
             map_from_centre: Pose::new(x, 0.0, heading),

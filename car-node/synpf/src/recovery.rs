@@ -150,8 +150,8 @@ impl Doubt {
     }
 
     /// True when the scan has fitted worse than before for long enough, or suddenly worse, to ask whether another place
-    /// fits better.
-    /// `ratio` is `w_fast / w_slow`; `surprised` says that the fit is below what is usual. An opponent in view looks the same at first; the comparison tells them apart.
+    /// fits better. `ratio` is `w_fast / w_slow`; `surprised` says that the fit is below what is usual. An opponent in view
+    /// looks the same at first; the comparison tells them apart.
     pub(crate) fn asks(
         &mut self,
         alignment: f64,

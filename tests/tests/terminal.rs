@@ -97,6 +97,10 @@ async fn driving(hub: &Hub, car: &CarName) {
     }
 }
 
+#[expect(
+    clippy::too_many_lines,
+    reason = "a table of command lines, which reads best in one piece"
+)]
 #[tokio::test(flavor = "multi_thread")]
 async fn each_outcome_has_its_exit_code_and_its_words() {
     let endpoint = free_endpoint();

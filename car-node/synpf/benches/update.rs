@@ -21,6 +21,8 @@ use synpf::{Localizer, Parameters, Scan, Stage, TrackMap};
 struct Drive {
     localizer: Localizer,
     scans: Vec<Scan>,
+    /// Between two scans [s].
+    period: f64,
     step: usize,
     odom: f64,
 }
@@ -31,13 +33,14 @@ impl Drive {
             Localizer::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, 1).expect("a sound set");
         localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
         localizer.initialize(truth(0.0)).expect("finite");
-        // One lap, which the benchmark goes around again and again.
-        let scans = (1..=(common::lap() / 0.025) as usize)
-            .map(|k| scan(map, k as f64 * 0.025))
-            .collect();
+        // One lap in whole scans, which the benchmark goes around again and again.
+        let count = (common::lap() / 0.025).round() as usize;
+        let period = common::lap() / count as f64;
+        let scans = (1..=count).map(|k| scan(map, k as f64 * period)).collect();
         let mut drive = Self {
             localizer,
             scans,
+            period,
             step: 0,
             odom: 0.0,
         };
@@ -47,7 +50,7 @@ impl Drive {
 
     fn update(&mut self) {
         self.step += 1;
-        let at = self.step as f64 * 0.025;
+        let at = self.step as f64 * self.period;
         while self.odom + 0.02 <= at {
             self.odom += 0.02;
             self.localizer

@@ -12,6 +12,11 @@ SECONDS = 45
 
 
 def main(program):
+    """A machine that stands still for seconds, as shared ones do, loses a race in real time: one more chance."""
+    return attempt(program) and attempt(program)
+
+
+def attempt(program):
     # Long enough for a lap of the bundled track, and for a slow machine to begin with one.
     command = [program, "--for", f"{SECONDS}s", "--json"]
     print(" ".join(command), flush=True)

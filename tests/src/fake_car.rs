@@ -64,6 +64,15 @@ impl CarState {
 const SETS: [&str; 2] = ["hq", "lq"];
 
 impl FakeCar {
+    /// A car called `mute`, which answers no command.
+    pub async fn start_mute(endpoint: &str) -> Self {
+        let behaviour = Behaviour {
+            mute: true,
+            ..Behaviour::default()
+        };
+        Self::start("mute", endpoint, behaviour).await
+    }
+
     /// Dials the pit wall at `endpoint` and drives off.
     pub async fn start(name: &str, endpoint: &str, behaviour: Behaviour) -> Self {
         let name = CarName::new(name).expect("a good name");

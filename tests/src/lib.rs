@@ -1,23 +1,39 @@
 //! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
-//! protocol, a bag of a drive in a drawn room, and waiting for conditions.
+//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, and waiting for conditions.
 
 #[cfg(feature = "browser")]
 mod browser;
 mod fake_car;
+mod real_car;
 mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
+pub use real_car::start_real;
 pub use synthetic_bag::{room, true_pose, write_bag};
 
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use pitwall::Role;
+use protocol::{Action, CarName, ParamsAction};
 
 /// How long anything may take before a test gives up.
 pub const DEADLINE: Duration = Duration::from_secs(20);
+
+/// A car's name.
+pub fn named(name: &str) -> CarName {
+    CarName::new(name).expect("a good name")
+}
+
+/// Puts a set in force, for good.
+pub fn select(name: &str) -> Action {
+    Action::Params(ParamsAction::Select {
+        name: name.into(),
+        revert_after_ms: None,
+    })
+}
 
 /// An endpoint on loopback that nobody else uses.
 pub fn free_endpoint() -> String {

@@ -1,47 +1,14 @@
 //! Commands that can be trusted: whatever goes wrong, the car is in a known state, and whoever asked is told which.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::Race;
 use pitwall::{Hub, Verdict, new_command_id};
 use protocol::{
     Action, CarName, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps,
     Telemetry, Topic, Value, encode,
 };
-use simulator::{CarSetup, Track};
-use synpf::TrackMap;
-use system_tests::{Behaviour, FakeCar, client, free_endpoint, router, wait_until};
-
-/// A whole car on a simulated track.
-fn start(name: &CarName, endpoint: &str, state: Option<&Path>) -> Node {
-    let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
-    let track = Track::load(tracks.join("club")).expect("bundled");
-    let map = RaceMap {
-        name: track.name.clone(),
-        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
-        raceline: Some(Arc::new(track.raceline.clone())),
-    };
-    let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
-    let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
-    config.begin = Begin::Source;
-    config.connect = vec![endpoint.to_owned()];
-    config.state = state.map(Path::to_owned);
-    Node::start(config).expect("a car")
-}
-
-fn named(name: &str) -> CarName {
-    CarName::new(name).expect("a good name")
-}
-
-fn select(name: &str) -> Action {
-    Action::Params(ParamsAction::Select {
-        name: name.into(),
-        revert_after_ms: None,
-    })
-}
+use system_tests::{FakeCar, client, free_endpoint, named, router, select, start_real, wait_until};
 
 fn revision(verdict: &Verdict) -> u64 {
     match verdict {
@@ -65,7 +32,7 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
     let events = hub.tap();
     hub.link().subscribe_recorded(true).await.expect("subscribed");
     let car = named("car-1");
-    let node = start(&car, &endpoint, None);
+    let node = start_real(&car, 0.0, &endpoint, None);
     assert!(
         hub.wait_until(Duration::from_secs(90), |fleet| {
             fleet
@@ -158,7 +125,7 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
     let first = Hub::open(&router(&endpoint)).await.expect("a link");
     let second = Hub::open(&client(&endpoint)).await.expect("a link");
     let car = named("car-1");
-    let node = start(&car, &endpoint, None);
+    let node = start_real(&car, 0.0, &endpoint, None);
     for hub in [&first, &second] {
         assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
         wait_until("the set in force is known", || known(hub, &car).is_some()).await;
@@ -208,7 +175,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
     let folder = tempfile::tempdir().expect("a folder");
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
     let car = named("car-1");
-    let node = start(&car, &endpoint, Some(folder.path()));
+    let node = start_real(&car, 0.0, &endpoint, Some(folder.path()));
     assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
     let command = Command {
         id: new_command_id(),
@@ -247,7 +214,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         "{}",
         gone.text(&car)
     );
-    let node = start(&car, &endpoint, Some(folder.path()));
+    let node = start_real(&car, 0.0, &endpoint, Some(folder.path()));
     assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
     wait_until("the set in force is known", || {
         known(&hub, &car).is_some_and(|(name, _)| name == "lq")
@@ -276,15 +243,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
 async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
     let endpoint = free_endpoint();
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let mute = FakeCar::start(
-        "mute",
-        &endpoint,
-        Behaviour {
-            mute: true,
-            ..Behaviour::default()
-        },
-    )
-    .await;
+    let mute = FakeCar::start_mute(&endpoint).await;
     assert!(hub.wait_for(mute.name(), system_tests::DEADLINE).await);
     let command = |action| Command {
         id: new_command_id(),
@@ -320,7 +279,7 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
     let endpoint = free_endpoint();
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
     let car = named("car-1");
-    let node = start(&car, &endpoint, None);
+    let node = start_real(&car, 0.0, &endpoint, None);
     assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
     wait_until("the set in force is known", || known(&hub, &car).is_some()).await;
     let before = known(&hub, &car);
@@ -455,7 +414,7 @@ async fn acknowledgements_with_three_cars() {
     let cars = ["car-1", "car-2", "car-3"].map(named);
     let nodes: Vec<_> = cars
         .iter()
-        .map(|car| start(car, &endpoint, Some(&folder.path().join(car.as_str()))))
+        .map(|car| start_real(car, 0.0, &endpoint, Some(&folder.path().join(car.as_str()))))
         .collect();
     for car in &cars {
         wait_until("the set in force is known", || known(&hub, car).is_some()).await;

@@ -285,12 +285,8 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
 #[tokio::test(flavor = "multi_thread")]
 async fn refusals_silence_candidates_and_markers_are_shown() {
     let stage = Stage::set().await;
-    let mute = Behaviour {
-        mute: true,
-        ..Behaviour::default()
-    };
     let car = FakeCar::start("car-1", &stage.endpoint, Behaviour::default()).await;
-    let silent = FakeCar::start("mute", &stage.endpoint, mute).await;
+    let silent = FakeCar::start_mute(&stage.endpoint).await;
     let browser = stage.browser().await;
     browser
         .wait(

@@ -1,34 +1,13 @@
 //! Bytes that are no message, on every key and both ways: refused, counted, said once, and neither side minds.
 
-use std::path::Path;
-use std::sync::Arc;
 use std::time::Duration;
 
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::Race;
 use pitwall::Hub;
 use protocol::{
     Action, CarName, Command, CommandId, Key, LinkReport, Message, ParamsAction, Stamps, Topic, encode,
 };
-use simulator::{CarSetup, Track};
-use synpf::TrackMap;
-use system_tests::{free_endpoint, router, wait_until};
+use system_tests::{free_endpoint, router, select, start_real, wait_until};
 use zenoh::qos::CongestionControl;
-
-fn start(name: &CarName, endpoint: &str) -> Node {
-    let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
-    let track = Track::load(tracks.join("club")).expect("bundled");
-    let map = RaceMap {
-        name: track.name.clone(),
-        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
-        raceline: Some(Arc::new(track.raceline.clone())),
-    };
-    let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
-    let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
-    config.begin = Begin::Source;
-    config.connect = vec![endpoint.to_owned()];
-    Node::start(config).expect("a car")
-}
 
 /// A program that belongs to nobody.
 async fn stranger(endpoint: &str) -> zenoh::Session {
@@ -62,10 +41,7 @@ fn garbage() -> Vec<Vec<u8>> {
         id: CommandId(1),
         operator: "stranger".into(),
         expected_revision: None,
-        action: Action::Params(ParamsAction::Select {
-            name: "lq".into(),
-            revert_after_ms: None,
-        }),
+        action: select("lq"),
     };
     let command = encode(&command, stamps).expect("a good message");
     let report = LinkReport {
@@ -126,7 +102,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
     hub.link().subscribe_recorded(true).await.expect("subscribed");
     let car = CarName::new("car-1").expect("a good name");
-    let node = start(&car, &endpoint);
+    let node = start_real(&car, 0.0, &endpoint, None);
     let updates = || {
         hub.fleet()
             .car(&car)

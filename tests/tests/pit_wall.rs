@@ -3,15 +3,8 @@
 use std::collections::BTreeMap;
 
 use pitwall::{Hub, Report, Verdict, read_events, unix_now};
-use protocol::{Action, CarName, Outcome, ParamsAction, Topic};
-use system_tests::{Behaviour, DEADLINE, FakeCar, client, free_endpoint, router, wait_until};
-
-fn select(name: &str) -> Action {
-    Action::Params(ParamsAction::Select {
-        name: name.into(),
-        revert_after_ms: None,
-    })
-}
+use protocol::{CarName, Outcome, Topic};
+use system_tests::{Behaviour, DEADLINE, FakeCar, client, free_endpoint, router, select, wait_until};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_car_shows_up_and_is_blind_when_it_leaves() {
@@ -78,15 +71,7 @@ async fn each_outcome_of_a_command_is_told_apart() {
     let endpoint = free_endpoint();
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
-    let mute = FakeCar::start(
-        "mute",
-        &endpoint,
-        Behaviour {
-            mute: true,
-            ..Behaviour::default()
-        },
-    )
-    .await;
+    let mute = FakeCar::start_mute(&endpoint).await;
     assert!(hub.wait_for(car.name(), DEADLINE).await && hub.wait_for(mute.name(), DEADLINE).await);
     let give = async |name: &CarName, expect, action| {
         hub.link()

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use pitwall::{Hub, Verdict, new_command_id};
 use protocol::{Action, CarName, Command, EventKind, Outcome, ParamsAction, Telemetry};
-use system_tests::{Behaviour, FakeCar, free_endpoint, router, wait_until};
+use system_tests::{FakeCar, free_endpoint, named, router, select, wait_until};
 
 /// A child that does not outlive the test.
 struct Killed(Child);
@@ -65,19 +65,12 @@ async fn say(endpoint: &str, words: &[&str]) -> (i32, String) {
     (status.code().expect("an exit code"), said)
 }
 
-fn named(name: &str) -> CarName {
-    CarName::new(name).expect("a good name")
-}
-
-fn select(name: &str) -> Command {
+fn command(name: &str) -> Command {
     Command {
         id: new_command_id(),
         operator: "ana".into(),
         expected_revision: None,
-        action: Action::Params(ParamsAction::Select {
-            name: name.into(),
-            revert_after_ms: None,
-        }),
+        action: select(name),
     }
 }
 
@@ -108,15 +101,7 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
     let real = named("car-1");
     let _car = car("car-1", &endpoint, folder.path());
-    let mute = FakeCar::start(
-        "mute",
-        &endpoint,
-        Behaviour {
-            mute: true,
-            ..Behaviour::default()
-        },
-    )
-    .await;
+    let mute = FakeCar::start_mute(&endpoint).await;
     assert!(hub.wait_for(mute.name(), system_tests::DEADLINE).await);
     driving(&hub, &real).await;
     let file = |name: &str, text: &str| {
@@ -281,7 +266,7 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         // Given again, it ends in the set that was wanted.
         let again = hub
             .link()
-            .send(&real, &select(name), pitwall::PATIENCE)
+            .send(&real, &command(name), pitwall::PATIENCE)
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{again:?}");
@@ -311,7 +296,7 @@ async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_
     // Killed when the command has just left, and later and later in its way.
     for (name, microseconds) in [("lq", 0), ("hq", 2_000), ("lq", 20_000)] {
         let before = in_force(&hub, &real).expect("known");
-        let command = select(name);
+        let command = command(name);
         let (verdict, ()) = tokio::join!(hub.link().send(&real, &command, pitwall::PATIENCE), async {
             // Not a wait for anything: the moment is what is tried.
             tokio::time::sleep(Duration::from_micros(microseconds)).await;

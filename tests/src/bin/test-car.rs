@@ -6,17 +6,12 @@
 //! test-car rings COUNT ENDPOINT               cars made of nothing but protocol, car-1 to car-COUNT, at full rate
 //! ```
 
-use std::path::PathBuf;
-use std::sync::Arc;
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::Race;
 use protocol::CarName;
-use simulator::{CarSetup, Track};
-use synpf::TrackMap;
-use system_tests::{Behaviour, FakeCar};
+use system_tests::{Behaviour, FakeCar, start_real};
 
 /// Nobody is served by a car that outlives a test that was killed.
 const LONGEST: Duration = Duration::from_mins(10);
@@ -30,7 +25,7 @@ fn main() -> anyhow::Result<()> {
             name,
             start.parse().context("START")?,
             endpoint,
-            Some(state.into()),
+            Some(Path::new(state)),
         ),
         ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint),
         _ => bail!("usage: test-car race NAME START ENDPOINT [STATE] | rings COUNT ENDPOINT"),
@@ -38,23 +33,8 @@ fn main() -> anyhow::Result<()> {
 }
 
 /// A car that starts at `start` [m] along the raceline.
-fn race(name: &str, start: f64, endpoint: &str, state: Option<PathBuf>) -> anyhow::Result<()> {
-    let track = Track::find("club")?;
-    let map = RaceMap {
-        name: track.name.clone(),
-        map: Arc::new(TrackMap::new(track.grid.clone())?),
-        raceline: Some(Arc::new(track.raceline.clone())),
-    };
-    let setup = CarSetup {
-        start,
-        ..CarSetup::default()
-    };
-    let race = Race::new(track, vec![setup], 1, Vec::new());
-    let mut config = NodeConfig::new(CarName::new(name)?, map, Box::new(race.car(0)));
-    config.begin = Begin::Source;
-    config.connect = vec![endpoint.to_owned()];
-    config.state = state;
-    let node = Node::start(config)?;
+fn race(name: &str, start: f64, endpoint: &str, state: Option<&Path>) -> anyhow::Result<()> {
+    let node = start_real(&CarName::new(name)?, start, endpoint, state);
     std::thread::sleep(LONGEST);
     node.shutdown("the test is over");
     Ok(())

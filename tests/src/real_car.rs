@@ -1,0 +1,30 @@
+//! A whole car, filter and all, on a simulated track.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::source::Race;
+use protocol::CarName;
+use simulator::{CarSetup, Track};
+use synpf::TrackMap;
+
+/// Starts it at `start` [m] along the line of `club`; it dials the pit wall at `endpoint`, and keeps in `state` what survives a restart.
+pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Path>) -> Node {
+    let track = Track::find("club").expect("bundled");
+    let map = RaceMap {
+        name: track.name.clone(),
+        map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),
+        raceline: Some(Arc::new(track.raceline.clone())),
+    };
+    let setup = CarSetup {
+        start,
+        ..CarSetup::default()
+    };
+    let race = Race::new(track, vec![setup], 1, Vec::new());
+    let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
+    config.begin = Begin::Source;
+    config.connect = vec![endpoint.to_owned()];
+    config.state = state.map(Path::to_owned);
+    Node::start(config).expect("a car")
+}

@@ -274,6 +274,7 @@ impl Node {
                 clock,
                 session_number,
                 track_map: map.map,
+                search_patience: desk::SEARCH_PATIENCE,
                 map: map_message,
                 info,
             },

@@ -436,6 +436,35 @@ pub(crate) fn answer(outcome: Outcome) -> Answer {
     }
 }
 
+/// Messages of all kinds, encoded.
+pub(crate) fn all() -> Vec<Vec<u8>> {
+    fn bytes<M: Message>(message: &M) -> Vec<u8> {
+        encode(message, Stamps::default()).expect("a good message")
+    }
+    let mut all = vec![
+        bytes(&pose()),
+        bytes(&cloud()),
+        bytes(&scan_view()),
+        bytes(&health(State::Lost)),
+        bytes(&load()),
+        bytes(&shadow()),
+        bytes(&params()),
+        bytes(&recorded_scan()),
+        bytes(&map()),
+        bytes(&info()),
+        bytes(&ClockRequest { sent: 5 }),
+        bytes(&LinkReport {
+            transit: 0.5,
+            uncertainty: 0.125,
+            poses: 40,
+        }),
+    ];
+    all.extend(event_kinds().into_iter().map(|kind| bytes(&event(kind))));
+    all.extend(actions().into_iter().map(|action| bytes(&command(action))));
+    all.extend(outcomes().into_iter().map(|outcome| bytes(&answer(outcome))));
+    all
+}
+
 pub(crate) fn any_number() -> impl Strategy<Value = f64> {
     prop_oneof![Just(0.0), Just(-0.0), Just(f64::MAX), -1e3..1e3]
 }

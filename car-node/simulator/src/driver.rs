@@ -23,6 +23,8 @@ pub struct DriverParams {
     pub steering_lead: f64,
     /// Steering against a yaw rate that is not the line's [s].
     pub yaw_damping: f64,
+    /// Time in which a servo's centre that is off gets known, about [s]; infinite: it never does.
+    pub trim_time: f64,
     /// Least and most look-ahead [m].
     pub lookahead_range: [f64; 2],
     /// Speed over the raceline's own.
@@ -45,8 +47,9 @@ impl Default for DriverParams {
             delay: Duration::from_millis(20),
             lookahead_base: 0.25,
             lookahead_gain: 0.14,
-            steering_lead: 0.12,
+            steering_lead: 0.154,
             yaw_damping: 0.02,
+            trim_time: 5.0,
             lookahead_range: [0.6, 3.0],
             speed_scale: 1.0,
             speed_lookahead: 0.10,
@@ -103,6 +106,8 @@ pub struct Driver {
     manoeuvre: Manoeuvre,
     /// Since when the car has not moved although told to.
     stuck_since: Option<Duration>,
+    /// Steering that takes the car straight on, as far as it is known [rad].
+    trim: f64,
 }
 
 /// Further off the line's heading than this [rad] the car is turned round at walking speed.
@@ -115,6 +120,10 @@ const SLIPPING: f64 = 0.5;
 const WALKING: f64 = 0.8;
 /// A manoeuvre's leg.
 const LEG: Duration = Duration::from_millis(900);
+/// No servo is mounted worse than this [rad].
+const MOST_TRIM: f64 = 0.05;
+/// Further off the line [m] the servo is not what is wrong.
+const NEAR: f64 = 0.1;
 /// Not moving for this long is being stuck.
 const STUCK: Duration = Duration::from_millis(1500);
 
@@ -126,6 +135,7 @@ impl Driver {
             vehicle,
             manoeuvre: Manoeuvre::Racing,
             stuck_since: None,
+            trim: 0.0,
         }
     }
 
@@ -139,7 +149,7 @@ impl Driver {
         &self.params
     }
 
-    /// Forgets what happened before: the car was put back on the line.
+    /// Forgets what happened before: the car was put back on the line. Its servo is the same.
     pub fn reset(&mut self) {
         self.manoeuvre = Manoeuvre::Racing;
         self.stuck_since = None;
@@ -170,10 +180,9 @@ impl Driver {
             Manoeuvre::Racing => {
                 let speed = self.speed(estimate.speed, position.s, position.d, off_heading, ahead, line);
                 self.note_progress(now, estimate.speed, speed);
-                Controls {
-                    speed,
-                    steering: self.steering(estimate, pose, sideslip, position.s, line),
-                }
+                let steering = self.steering(estimate, pose, sideslip, position.s, line);
+                self.learn_trim(estimate.speed, position.d);
+                Controls { speed, steering }
             }
             Manoeuvre::Stopping => Controls::default(),
             // Both legs turn the nose towards the line's heading.
@@ -273,8 +282,7 @@ impl Driver {
     fn steering(&self, estimate: &Estimate, pose: Pose, sideslip: f64, s: f64, line: &Raceline) -> f64 {
         let p = &self.params;
         let speed = estimate.speed.max(0.5);
-        let [least, most] = p.lookahead_range;
-        let lookahead = (p.lookahead_base + p.lookahead_gain * speed).clamp(least, most);
+        let lookahead = self.lookahead(speed);
         let target = line.at(s + lookahead);
         let course = Pose::new(pose.x, pose.y, pose.heading + sideslip);
         // A car on the line would cut the bend towards the same point; only the difference is an error.
@@ -291,7 +299,26 @@ impl Driver {
         // A tail that steps out is caught before it is seen in the position.
         let now = line.project([estimate.pose.x, estimate.pose.y]);
         let yaw_error = speed * line.at(now.s).curvature - estimate.yaw_rate;
-        turn.steering + p.yaw_damping * yaw_error
+        turn.steering + self.trim + p.yaw_damping * yaw_error
+    }
+
+    /// Distance to the point on the line that is steered at [m].
+    fn lookahead(&self, speed: f64) -> f64 {
+        let p = &self.params;
+        let [least, most] = p.lookahead_range;
+        (p.lookahead_base + p.lookahead_gain * speed).clamp(least, most)
+    }
+
+    /// Takes a little of the steering that pursuit asks for at `d` [m] beside the line into the trim, so that what lasts is
+    /// steered before it is seen: integral action (Astrom and Murray, *Feedback Systems*, section 11.1). On `d` and not on
+    /// the steering itself, which the tyres' limit cuts in bends.
+    fn learn_trim(&mut self, speed: f64, d: f64) {
+        if speed < SLIPPING || d.abs() > NEAR {
+            return;
+        }
+        let asked = -2.0 * d / self.lookahead(speed).powi(2) * self.vehicle.wheelbase();
+        let share = self.params.period.as_secs_f64() / self.params.trim_time;
+        self.trim = (self.trim + share * asked).clamp(-MOST_TRIM, MOST_TRIM);
     }
 }
 
@@ -304,6 +331,7 @@ fn arc_to(from: Pose, point: [f64; 2]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Vehicle;
     use std::f64::consts::{PI, TAU};
 
     fn circle() -> Raceline {
@@ -338,6 +366,68 @@ mod tests {
         };
         assert!(on_line(4.5) > on_line(4.0) && on_line(4.0) > on_line(3.5));
         assert!(on_line(4.0) > 0.0, "the line turns left");
+    }
+
+    #[test]
+    fn a_servo_that_is_off_gets_known() {
+        // A car with the servo's centre 0.01 rad to the left on a circle, on its true pose.
+        let line = circle();
+        let offset = |trim_time: f64| {
+            let params = DriverParams {
+                trim_time,
+                ..DriverParams::default()
+            };
+            let car = VehicleParams {
+                steering_offset: 0.01,
+                ..VehicleParams::default()
+            };
+            let mut driver = Driver::new(params, car);
+            let mut vehicle = Vehicle::at_rest(car, Pose::new(4.0, 0.0, PI / 2.0));
+            let mut sum = 0.0;
+            for i in 0..2000 {
+                let now = params.period * i;
+                let [speed, _, yaw_rate] = vehicle.twist();
+                let pose = vehicle.pose();
+                let estimate = Estimate {
+                    time: now,
+                    pose,
+                    speed,
+                    yaw_rate,
+                };
+                let controls = driver.drive(now, Some(&estimate), None, &line);
+                vehicle.drive(controls, params.period.as_secs_f64());
+                if i >= 1500 {
+                    sum += line.project([pose.x, pose.y]).d / 500.0;
+                }
+            }
+            (sum, driver.trim)
+        };
+        let (untrimmed, none) = offset(f64::INFINITY);
+        let (trimmed, trim) = offset(DriverParams::default().trim_time);
+        assert!(untrimmed > 0.004 && none.abs() < 1e-12, "{untrimmed} m");
+        // What the driver's model of the car does not know is in the trim, too.
+        assert!(trimmed.abs() < 0.001, "{trimmed} m");
+        assert!((trim + 0.01).abs() < 0.005, "{trim} rad");
+    }
+
+    #[test]
+    fn a_car_far_off_the_line_says_nothing_of_its_servo() {
+        let line = circle();
+        let mut driver = driver();
+        for (x, known) in [(4.5, false), (3.5, false), (4.05, true)] {
+            let estimate = at(Pose::new(x, 0.0, PI / 2.0), 3.0);
+            driver.drive(Duration::ZERO, Some(&estimate), None, &line);
+            assert_eq!(driver.trim != 0.0, known, "at {x} m");
+        }
+        // Nor does any offset for ever.
+        let estimate = at(Pose::new(4.05, 0.0, PI / 2.0), 3.0);
+        for _ in 0..10_000 {
+            driver.drive(Duration::ZERO, Some(&estimate), None, &line);
+        }
+        assert!((driver.trim - MOST_TRIM).abs() < 1e-12, "{}", driver.trim);
+        // The marshals carry the car, not its servo.
+        driver.reset();
+        assert!(driver.trim > 0.0);
     }
 
     #[test]

@@ -695,17 +695,18 @@ mod tests {
             };
             let mut world = World::new(ring(), &[setup], 1);
             let (mut sum, mut count) = (0.0, 0.0);
-            while world.truth(0).laps < 2 && world.now() < Duration::from_secs(40) {
+            while world.truth(0).laps < 3 && world.now() < Duration::from_secs(60) {
                 world.step();
-                if world.on_a_lap(0) {
+                if world.truth(0).laps > 0 {
                     sum += world.truth(0).track.d.abs();
                     count += 1.0;
                 }
             }
-            assert_eq!(world.truth(0).laps, 2);
+            assert_eq!(world.truth(0).laps, 3);
             sum / count
         };
-        // A centimetre, most of it the servo's offset; the driver of 2023 without a model of slip was 5 and 8 cm off.
-        assert!(off(Grip::HQ) < 0.02 && off(Grip::LQ) < 0.02);
+        // Half a centimetre, once the driver knows the servo's centre; without a model of slip it is 5 and 8 cm.
+        let (hq, lq) = (off(Grip::HQ), off(Grip::LQ));
+        assert!(hq < 0.008 && lq < 0.008, "{hq} m, {lq} m");
     }
 }

@@ -695,7 +695,7 @@ mod tests {
             };
             let mut world = World::new(ring(), &[setup], 1);
             let (mut sum, mut count) = (0.0, 0.0);
-            while world.truth(0).laps < 3 && world.now() < Duration::from_secs(60) {
+            while world.truth(0).laps < 3 && world.now() < Duration::from_secs(50) {
                 world.step();
                 if world.truth(0).laps > 0 {
                     sum += world.truth(0).track.d.abs();

@@ -3,9 +3,9 @@
 use crate::{Cell, OccupancyGrid, Pose};
 
 impl OccupancyGrid {
-    /// Range that a laser at `map_from_laser` measures along its x axis [m]: to the face of the first cell that
-    /// is not free, walking every cell on the way (Amanatides and Woo, Eurographics 1987). `max_range` if nothing
-    /// is nearer; 0 if the laser itself is not in free space.
+    /// Range that a laser at `map_from_laser` measures along its x axis [m]: to the face of the first occupied cell,
+    /// walking every cell on the way (Amanatides and Woo, Eurographics 1987); the unknown stops nothing. `max_range` if
+    /// nothing is nearer; 0 if the laser itself is not in free space.
     pub fn cast(&self, map_from_laser: Pose, max_range: f64) -> f64 {
         let laser = self.origin.inverse() * map_from_laser;
         let start = [laser.x / self.resolution, laser.y / self.resolution];
@@ -34,7 +34,7 @@ impl OccupancyGrid {
             }
             cell[axis] += step[axis];
             next[axis] += between[axis];
-            if self.cell(cell[0], cell[1]) != Cell::Free {
+            if self.cell(cell[0], cell[1]) == Cell::Occupied {
                 return path * self.resolution;
             }
         }
@@ -65,6 +65,17 @@ mod tests {
         assert!((room.cast(laser, 2.0) - 2.0).abs() < 1e-12);
         let in_the_wall = room.origin * Pose::new(0.05, 3.0, 0.0);
         assert!(room.cast(in_the_wall, 30.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_unknown_stops_no_ray() {
+        let mut room = room();
+        // An unmapped doorway, with a wall behind it that was seen through the gap.
+        for i in 0..60 {
+            room.cells[i * 100 + 70] = Cell::Unknown;
+        }
+        let laser = room.origin * Pose::new(5.0, 3.0, 0.0);
+        assert!((room.cast(laser, 30.0) - 4.9).abs() < 1e-9);
     }
 
     proptest! {

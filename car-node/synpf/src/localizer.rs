@@ -487,12 +487,14 @@ impl Localizer {
             p.diffusion_xy.powi(2) * seconds,
             p.diffusion_heading.powi(2) * seconds,
         ];
-        let speed_error = if self.slip_model.spinning() {
-            p.odometry_speed_error.max(SPINNING_SPEED_ERROR)
+        let along = if self.slip_model.spinning() {
+            // Wheels that lock stand still, and the car slides on.
+            let way = distance.max(self.slip_window.speed().abs() * seconds);
+            p.odometry_speed_error.max(SPINNING_SPEED_ERROR) * way
         } else {
-            p.odometry_speed_error
+            p.odometry_speed_error * distance
         };
-        let along = (speed_error * distance * widen).powi(2) + steady[0];
+        let along = (along * widen).powi(2) + steady[0];
         let across = (p.odometry_side_error * distance * widen).powi(2) + steady[0];
         let turn = (p.odometry_yaw_error * motion.heading * widen).powi(2) + steady[1];
         Matrix3::from_diagonal(&Vector3::new(along, across, turn))

@@ -98,6 +98,17 @@ impl SlipWindow {
         }
     }
 
+    /// The car's own speed over the window [m/s]; zero before there is one.
+    pub(crate) fn speed(&self) -> f64 {
+        let sum = |of: fn(&Step) -> f64| self.steps.iter().map(of).sum::<f64>();
+        let seconds = sum(|step| step.seconds);
+        if seconds > 0.0 {
+            sum(|step| step.posterior[0]) / seconds
+        } else {
+            0.0
+        }
+    }
+
     /// Forgets, because the pose has jumped.
     pub(crate) fn clear(&mut self) {
         self.steps.clear();

@@ -580,6 +580,8 @@ fn obstacle(vehicle: &Vehicle) -> Obstacle {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{Surface, Wall, Walls};
+    use maps::{Cell, OccupancyGrid, Raceline};
 
     fn ring() -> Arc<Track> {
         Arc::new(Track::bundled("club").expect("it ships"))
@@ -658,6 +660,97 @@ mod tests {
         }
         world.step();
         assert!(world.cars[0].controls.speed > 0.0);
+    }
+
+    /// The first scan of a car that stands on a circle of 4 m in a hall of 20 m, with a flawless laser; further cars stand
+    /// on the line, and further walls in the hall.
+    fn first_scan(others: &[f64], screens: &[Wall]) -> (World, Scan) {
+        let circle: Vec<_> = (0..60)
+            .map(|i| std::f64::consts::TAU * f64::from(i) / 60.0)
+            .map(|a| [4.0 * a.cos(), 4.0 * a.sin()])
+            .collect();
+        let hall = Wall {
+            surface: Surface::Plain,
+            points: vec![
+                [-10.0, -10.0],
+                [10.0, -10.0],
+                [10.0, 10.0],
+                [-10.0, 10.0],
+                [-10.0, -10.0],
+            ],
+        };
+        let track = Track {
+            name: "hall".into(),
+            grid: OccupancyGrid::new(1, 1, 0.05, Pose::IDENTITY, vec![Cell::Free]),
+            raceline: Raceline::through(&circle, 3.0).expect("a valid line"),
+            walls: Walls::new(screens.iter().cloned().chain([hall]).collect()),
+        };
+        // Without an estimate a car stands where it is.
+        let car = CarSetup {
+            start: 0.0,
+            lidar: LidarParams {
+                noise: 0.0,
+                jitter: 0.0,
+                dropout: 0.0,
+                half_power: 1e-12,
+                ..LidarParams::default()
+            },
+            ..CarSetup::default()
+        };
+        let others = others.iter().map(|&start| CarSetup { start, ..car });
+        let setups: Vec<CarSetup> = [car].into_iter().chain(others).collect();
+        let mut world = World::new(Arc::new(track), &setups, 3);
+        while world.now() < Duration::from_secs(1) {
+            for output in world.step() {
+                if let (0, Message::Scan(scan)) = (output.car, output.message) {
+                    return (world, scan);
+                }
+            }
+        }
+        panic!("no scan in a second");
+    }
+
+    #[test]
+    fn a_car_ahead_stands_in_the_scan_exactly_where_it_is() {
+        let (_, alone) = first_scan(&[], &[]);
+        let (world, followed) = first_scan(&[2.0], &[]);
+        // The other car's outline as four walls: another way to meet it than the laser's.
+        let mut points = outline(world.cars[1].vehicle.params(), world.truth(1).pose).to_vec();
+        points.push(points[0]);
+        let body = Wall {
+            surface: Surface::Plain,
+            points,
+        };
+        let hall = world.track.walls.polylines().iter().cloned();
+        let walls = Walls::new(hall.chain([body]).collect());
+        let laser = world.truth(0).pose * world.cars[0].lidar.params().base_link_from_laser;
+        let mut shorter = 0;
+        for (beam, (&before, &after)) in alone.ranges.iter().zip(&followed.ranges).enumerate() {
+            let angle = laser.heading + alone.angle_min + beam as f64 * alone.angle_increment;
+            let hit = walls.cast([laser.x, laser.y], [angle.cos(), angle.sin()], 30.0);
+            let expected = hit.expect("a hall is closed").range;
+            // The device rounds to a millimetre.
+            assert!(
+                (f64::from(after) - expected).abs() < 0.001,
+                "beam {beam}: {before} m alone, {after} m, not {expected} m"
+            );
+            shorter += usize::from(after < before - 1.0);
+        }
+        // 0.28 m of bumper and a bit of its side, some 1.6 m away: 11 to 16 degrees of four beams each.
+        assert!((44..64).contains(&shorter), "{shorter} beams");
+    }
+
+    #[test]
+    fn a_car_behind_a_wall_is_not_in_the_scan() {
+        // Across the line, between the two cars, and higher than what the laser could pass.
+        let screen = [Wall {
+            surface: Surface::Plain,
+            points: vec![[0.0, 1.2], [9.0, 1.2]],
+        }];
+        let (_, alone) = first_scan(&[], &screen);
+        let (_, followed) = first_scan(&[2.0], &screen);
+        assert_eq!(alone.ranges, followed.ranges);
+        assert!(alone.ranges[540] < 1.5, "the wall is in view");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! A track: what is true (walls) and what the car is given (map and raceline).
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::Path;
 
 use maps::{MapError, OccupancyGrid, Raceline};
@@ -53,24 +54,48 @@ impl Track {
         })
     }
 
-    /// Writes the four files into a folder, which is made if need be.
-    pub fn save(&self, folder: impl AsRef<Path>) -> Result<(), MapError> {
+    /// Writes the track's files into a folder, which is made if need be, with the description that it was made from as
+    /// `track.yaml`. All of them or none: what stood there stays until every new file is on the disk.
+    pub fn save(&self, folder: impl AsRef<Path>, description: &str) -> Result<(), MapError> {
         let folder = folder.as_ref();
-        let write = |name: &str, bytes: &[u8]| {
-            let path = folder.join(name);
-            fs::write(&path, bytes).map_err(|source| MapError::Read {
-                file: path.display().to_string(),
-                source,
-            })
-        };
-        fs::create_dir_all(folder).map_err(|source| MapError::Read {
-            file: folder.display().to_string(),
+        let (yaml, png) = (self.grid.to_yaml("map.png"), self.grid.to_png());
+        let (line, walls) = (self.raceline.to_csv(), self.walls.to_csv());
+        let files = [
+            ("track.yaml", description.as_bytes()),
+            ("map.png", &png),
+            ("raceline.csv", line.as_bytes()),
+            ("walls.csv", walls.as_bytes()),
+            // Last, because it is what makes the folder a track.
+            ("map.yaml", yaml.as_bytes()),
+        ];
+        let fault = |path: &Path, source| MapError::Read {
+            file: path.display().to_string(),
             source,
-        })?;
-        write("map.yaml", self.grid.to_yaml("map.png").as_bytes())?;
-        write("map.png", &self.grid.to_png())?;
-        write("raceline.csv", self.raceline.to_csv().as_bytes())?;
-        write("walls.csv", self.walls.to_csv().as_bytes())
+        };
+        let new = !folder.exists();
+        fs::create_dir_all(folder).map_err(|source| fault(folder, source))?;
+        let part = |name: &str| folder.join(format!(".{name}.part"));
+        let written = files.iter().try_for_each(|(name, bytes)| {
+            let path = folder.join(name);
+            if path.is_dir() {
+                return Err(fault(&path, ErrorKind::IsADirectory.into()));
+            }
+            fs::write(part(name), bytes).map_err(|source| fault(&path, source))
+        });
+        if written.is_err() {
+            // What cannot be removed now could not be written either.
+            for (name, _) in &files {
+                fs::remove_file(part(name)).ok();
+            }
+            if new {
+                fs::remove_dir(folder).ok();
+            }
+            return written;
+        }
+        files.iter().try_for_each(|(name, _)| {
+            let path = folder.join(name);
+            fs::rename(part(name), &path).map_err(|source| fault(&path, source))
+        })
     }
 
     /// A track that ships, by name (one of [`BUNDLED`](crate::BUNDLED)). It is part of the program: no file is read.
@@ -107,5 +132,46 @@ impl Track {
             Some(track) => Ok(track),
             None => Self::load(name_or_path),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_track_is_saved_whole_or_not_at_all() {
+        let track = Track::bundled("club").expect("it ships");
+        let place = std::env::temp_dir().join(format!("track-{}", std::process::id()));
+        let names = |folder: &Path| -> Vec<String> {
+            let entries = fs::read_dir(folder).expect("a folder");
+            let mut names: Vec<_> = entries
+                .map(|entry| {
+                    entry
+                        .expect("an entry")
+                        .file_name()
+                        .to_string_lossy()
+                        .into_owned()
+                })
+                .collect();
+            names.sort();
+            names
+        };
+        // A folder where a file should go: nothing is written beside it, and the error names it.
+        let blocked = place.join("blocked");
+        fs::create_dir_all(blocked.join("walls.csv")).expect("a folder");
+        let error = track.save(&blocked, "name: x").expect_err("a folder in the way");
+        assert!(error.to_string().contains("walls.csv: "), "{error}");
+        assert_eq!(names(&blocked), ["walls.csv"]);
+
+        let free = place.join("free");
+        track.save(&free, "name: x").expect("room on the disk");
+        assert_eq!(
+            names(&free),
+            ["map.png", "map.yaml", "raceline.csv", "track.yaml", "walls.csv"]
+        );
+        let back = Track::load(&free).expect("what was written");
+        assert_eq!(back.grid.cells, track.grid.cells);
+        fs::remove_dir_all(&place).expect("our own folder");
     }
 }

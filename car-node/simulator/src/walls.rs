@@ -9,6 +9,8 @@ use crate::contour::contours;
 
 /// Edge of an index cell [m]: about what a ray crosses between two looks at the list of segments.
 const CELL: f64 = 0.5;
+/// How far walls may be apart [m].
+const MOST: f64 = 500.0;
 
 /// What a wall is made of, as the laser sees it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -262,6 +264,7 @@ impl Walls {
     pub fn parse(file: &str, csv: &str) -> Result<Self, MapError> {
         let mut walls: Vec<Wall> = Vec::new();
         let mut current = None;
+        let mut first = None;
         for (line, text) in (1..).zip(csv.lines()) {
             let text = text.trim();
             if text.is_empty() || text.starts_with('#') {
@@ -291,6 +294,13 @@ impl Walls {
             let point = [coordinate("x_m", x)?, coordinate("y_m", y)?];
             if point.iter().any(|v| v.abs() > 1e4) {
                 return Err(fault(format!("{point:?} is more than 10 km away")));
+            }
+            // The index is a table over all the walls' ground.
+            let [x0, y0] = *first.get_or_insert(point);
+            if (point[0] - x0).abs() > MOST || (point[1] - y0).abs() > MOST {
+                return Err(fault(format!(
+                    "{point:?} is more than {MOST} m away from the first point"
+                )));
             }
             let number = number.to_owned();
             match walls.last_mut() {

@@ -18,9 +18,11 @@ pub(crate) mod track;
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 
+use anyhow::bail;
 use car_node::bag::{Bag, SensorLog, Topics};
 use car_node::frames::Mount;
 use car_node::sets::{self, NamedSet};
+use simulator::{BUNDLED, Track};
 
 use crate::cli::TopicArguments;
 
@@ -76,6 +78,15 @@ fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
         );
     }
     Ok(set)
+}
+
+/// A bundled track, or the one in a folder.
+fn find_track(name_or_path: &str) -> anyhow::Result<Track> {
+    if !BUNDLED.contains(&name_or_path) && !Path::new(name_or_path).exists() {
+        let bundled = BUNDLED.join(", ");
+        bail!("no track {name_or_path:?}: neither a folder or a file nor one of {bundled}");
+    }
+    Ok(Track::find(name_or_path)?)
 }
 
 /// Says why a command failed: each cause once, though some libraries repeat their source's words in their own.

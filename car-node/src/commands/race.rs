@@ -11,7 +11,7 @@ use serde::Serialize;
 use simulator::Track;
 use synpf::{Parameters, TrackMap};
 
-use super::load_set;
+use super::{find_track, load_set};
 use crate::cli;
 
 /// Some races of one kind, as reported.
@@ -29,7 +29,7 @@ struct Report {
 }
 
 pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
-    let track = Arc::new(Track::find(&arguments.track)?);
+    let track = Arc::new(find_track(&arguments.track)?);
     let map = TrackMap::new(track.grid.clone()).with_context(|| arguments.track.clone())?;
     let map = Arc::new(map);
     if arguments.table {

@@ -7,11 +7,9 @@ use anyhow::{Context, bail};
 use maps::Cell;
 use simulator::{Track, TrackReport, TrackSpec};
 
+use super::find_track;
 use crate::cli::TrackCommand;
 use crate::drawing;
-
-/// Name of a track's description, in its folder.
-const DESCRIPTION: &str = "track.yaml";
 
 pub(crate) fn run(command: &TrackCommand) -> anyhow::Result<()> {
     match command {
@@ -30,9 +28,9 @@ pub(crate) fn run(command: &TrackCommand) -> anyhow::Result<()> {
             };
             new(folder, &spec, &text, *force, *json)
         }
-        TrackCommand::Check { track, json } => check(&Track::find(track)?, *json),
+        TrackCommand::Check { track, json } => check(&find_track(track)?, *json),
         TrackCommand::Draw { track, svg, columns } => {
-            draw(&Track::find(track)?, svg.as_deref(), (*columns).into())
+            draw(&find_track(track)?, svg.as_deref(), (*columns).into())
         }
     }
 }
@@ -55,10 +53,10 @@ fn new(folder: &Path, spec: &TrackSpec, text: &str, force: bool, json: bool) -> 
         bail!("{} is there already; --force overwrites it", map.display());
     }
     let track = spec.generate().with_context(|| format!("track {}", spec.name))?;
-    track.save(folder)?;
-    let description = folder.join(DESCRIPTION);
-    fs::write(&description, text).with_context(|| description.display().to_string())?;
-    check(&track, json)
+    // A track that cannot be raced on is shown, with its faults, and not written.
+    check(&track, json)?;
+    track.save(folder, text)?;
+    Ok(())
 }
 
 /// Prints what a track is like; fails when it cannot be raced on.
@@ -72,7 +70,12 @@ fn check(track: &Track, json: bool) -> anyhow::Result<()> {
     match report.faults.len() {
         0 => Ok(()),
         1 => bail!("{} cannot be raced on: {}", report.name, report.faults[0]),
-        n => bail!("{} cannot be raced on: {n} faults", report.name),
+        n => bail!(
+            "{} cannot be raced on: {}, and {} more",
+            report.name,
+            report.faults[0],
+            n - 1
+        ),
     }
 }
 

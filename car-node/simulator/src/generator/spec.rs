@@ -16,6 +16,10 @@ pub const BUNDLED: [&str; 4] = ["club", "hall", "park", "mirror"];
 
 /// Distance between the points of the centre line [m].
 const SPACING: f64 = 0.05;
+/// Control points are at least so far apart [m].
+const CLOSEST: f64 = 0.1;
+/// Longest lap from control point to control point [m]: the raceline's equations are dense, and club tracks reach 540 m.
+const LONGEST: f64 = 600.0;
 
 /// A track, described: everything else is generated from it, the same every time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -116,6 +120,56 @@ impl TrackSpec {
             );
             return Some(("half_width", fault));
         }
+        self.misplaced().or_else(|| self.out_of_range())
+    }
+
+    /// What lies where nothing can: points in one place, lines and walls longer than can be worked on.
+    fn misplaced(&self) -> Option<(&'static str, String)> {
+        if self.name.is_empty() || self.name.len() > 64 || self.name.chars().any(char::is_control) {
+            let fault = format!("{:?} should be 1 to 64 printable characters", self.name);
+            return Some(("name", fault));
+        }
+        let (centre, _) = self.whole_lap();
+        let next = |i: usize| centre[(i + 1) % centre.len()];
+        if let Some(i) = (0..centre.len()).find(|&i| distance(centre[i], next(i)) < CLOSEST) {
+            let other = (i + 1) % centre.len();
+            let fault = format!(
+                "points {} and {} are less than {CLOSEST} m apart",
+                i + 1,
+                other + 1
+            );
+            return Some(("centre", fault));
+        }
+        let length: f64 = (0..centre.len()).map(|i| distance(centre[i], next(i))).sum();
+        if length > LONGEST {
+            let fault = format!("a lap of {length:.0} m; up to {LONGEST} m can be worked on");
+            return Some(("centre", fault));
+        }
+        for (i, block) in self.blocks.iter().enumerate() {
+            let sides = block.size.iter().all(|side| (0.01..=100.0).contains(side));
+            let near = centre.iter().any(|&point| distance(point, block.at) < 100.0);
+            // NaN is neither near nor of any size.
+            if !(sides && near && block.heading.is_finite()) {
+                let fault = format!(
+                    "block {} at {:?} of size {:?}, heading {}: sides of 0.01 m to 100 m, within 100 m of the centre line, are \
+                     needed",
+                    i + 1,
+                    block.at,
+                    block.size,
+                    block.heading
+                );
+                return Some(("blocks", fault));
+            }
+        }
+        let faulty = |b: &&BlackStretch| !(b.from >= 0.0 && b.from < b.to && b.to <= 1.0);
+        self.black.iter().find(faulty).map(|b| {
+            let fault = format!("from {} to {} should rise within [0, 1]", b.from, b.to);
+            ("black", fault)
+        })
+    }
+
+    /// The first number beyond what makes sense.
+    fn out_of_range(&self) -> Option<(&'static str, String)> {
         let m = &self.mapping;
         let s = &self.speed;
         let ranges = [
@@ -373,6 +427,38 @@ mod tests {
             ("[0, 3]]", "[0, .inf]]", "t.yaml: centre: "),
             ("seed: 7", "seed: x", "t.yaml: "),
             ("posts: 1.0", "poles: 1.0", "t.yaml: "),
+            ("name: oval", "name: ''", "t.yaml: name: "),
+            (
+                "[[0, 0], [4, -2]",
+                "[[0, 0], [0, 0], [4, -2]",
+                "t.yaml: centre: points 1 and 2 are",
+            ),
+            ("[8, 3]", "[800, 3]", "t.yaml: centre: a lap of 16"),
+            (
+                "posts: 1.0",
+                "black: [{ from: 0.9, to: 0.1, left: true }]",
+                "t.yaml: black: from 0.9 to 0.1",
+            ),
+            (
+                "posts: 1.0",
+                "black: [{ from: .nan, to: 1, left: true }]",
+                "t.yaml: black: from NaN",
+            ),
+            (
+                "posts: 1.0",
+                "blocks: [{ at: [4, 1], size: [-1, 1] }]",
+                "t.yaml: blocks: block 1 at [4.0, 1.0]",
+            ),
+            (
+                "posts: 1.0",
+                "blocks: [{ at: [4, 1], size: [1e9, 1] }]",
+                "t.yaml: blocks: block 1",
+            ),
+            (
+                "posts: 1.0",
+                "blocks: [{ at: [.nan, 1], size: [1, 1] }]",
+                "t.yaml: blocks: block 1",
+            ),
         ] {
             let error = TrackSpec::parse("t.yaml", &YAML.replace(from, to)).expect_err("a fault");
             assert!(

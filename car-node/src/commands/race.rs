@@ -182,17 +182,18 @@ fn mean_sigma(value: Option<MeanSigma>, scale: f64, digits: usize) -> String {
 
 fn print_table(arguments: &cli::Race, reports: &[Report]) {
     say!(
-        "{} laps on {}, {} seed(s)",
-        arguments.laps,
+        "laps on {}: {} with each of {} seeds; error to the line by the estimate, as the paper takes it, and by the truth",
         reports.first().map_or("", |report| &report.track),
+        arguments.laps,
         arguments.seeds
     );
     say!(
-        "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+        "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
         "localizer",
         "odom",
         "lap time",
         "error to line",
+        "true",
         "align paper",
         "ours",
         "pos rmse",
@@ -201,10 +202,11 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
         "crashes"
     );
     say!(
-        "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+        "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
         "",
         "",
         "s",
+        "cm",
         "cm",
         "%",
         "%",
@@ -216,11 +218,12 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
     for report in reports {
         let s = &report.summary;
         say!(
-            "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7.2} {:>8}",
+            "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7.2} {:>8}",
             report.localizer,
             name(report.odometry),
             mean_sigma(s.lap_time_s, 1.0, 3),
             mean_sigma(s.line_error_m, 100.0, 2),
+            or_dash(s.true_line_error_m.map(|error| error.mean), 100.0, 2),
             or_dash(s.alignment_paper, 100.0, 2),
             or_dash(s.alignment, 100.0, 2),
             or_dash(s.position_rmse_m, 100.0, 2),
@@ -233,11 +236,12 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
     for row in PAPER_ROWS {
         let pair = |[mean, sigma]: [f64; 2]| Some(MeanSigma { mean, sigma });
         say!(
-            "{:<16} {:<4} {:>15} {:>15} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
+            "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
             row.localizer,
             name(row.quality),
             mean_sigma(pair(row.lap_time_s), 1.0, 3),
             mean_sigma(pair(row.line_error_m), 100.0, 2),
+            "-",
             or_dash(Some(row.alignment), 100.0, 2),
             "-",
             "-",

@@ -372,8 +372,10 @@ impl Loop {
     }
 
     fn placed(&mut self, pose: Pose) {
+        let before = self.last_update.as_ref().map(|update| wire::pose2(update.pose));
         if self.initialize(pose).is_ok() {
             self.event(EventKind::PoseInitialized {
+                before,
                 pose: wire::pose2(pose),
             });
         }

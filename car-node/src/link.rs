@@ -48,6 +48,11 @@ pub enum LinkError {
 /// Where a pit wall on this machine listens.
 const LOCAL_WALL: &str = "tcp/127.0.0.1:7447";
 
+/// What the system may hold of what is sent [bytes]: enough for 10 Mbit/s at 10 ms there and back.
+const SEND_BUFFER: usize = 16 * 1024;
+/// What is written to the link in one piece [bytes]: a pose waits for no more than that of a scan.
+const BATCH: usize = 8 * 1024;
+
 /// Opens a session that dials `connect`; without one it looks for a pit wall on this machine and by multicast.
 pub fn open(connect: &[String]) -> Result<Session, LinkError> {
     let scout = connect.is_empty().to_string();
@@ -69,8 +74,15 @@ pub fn open(connect: &[String]) -> Result<Session, LinkError> {
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", scout),
         ("scouting/gossip/enabled", "false".to_owned()),
-        // A cut link is noticed within two seconds.
-        ("transport/link/tx/lease", "2000".to_owned()),
+        // A cut link is noticed within four seconds. Not sooner: on a radio that loses packets TCP is silent for two now and
+        // then, and to dial again takes longer than to wait.
+        ("transport/link/tx/lease", "4000".to_owned()),
+        // On a slow link what waits should wait here, where a pose overtakes a scan, and not in the system's buffers, where
+        // it does not: those would take megabytes, which is a minute of it.
+        ("transport/link/tcp/so_sndbuf", SEND_BUFFER.to_string()),
+        ("transport/link/tx/batch_size", BATCH.to_string()),
+        ("transport/link/tx/queue/size/data", "4".to_owned()),
+        ("transport/link/tx/queue/size/data_low", "16".to_owned()),
     ];
     let mut config = Config::default();
     for (key, value) in settings {
@@ -146,9 +158,11 @@ impl Outlet {
         if !topic.recovered() {
             return builder.wait().map(Self::Live).map_err(failed);
         }
+        // What fills a gap comes ahead of what can wait, as the message would have: else, on a link that is never idle, it
+        // would never come.
         let replies = RepliesConfig::default()
             .congestion_control(CongestionControl::Drop)
-            .priority(Priority::DataLow);
+            .priority(priority);
         let cache = CacheConfig::default()
             .max_samples((CACHE * RECORDED_RATE) as usize)
             .replies_config(replies);

@@ -486,9 +486,10 @@ fn declare_reports(
             .unwrap_or_else(PoisonError::into_inner)
             .on_report(wall_now(), &report);
         let kind = match change {
-            Some(Change::Lowered { transit, pose }) => EventKind::RatesLowered {
+            Some(Change::Lowered { transit, rates }) => EventKind::RatesLowered {
                 transit: transit as f32,
-                pose,
+                pose: rates.pose,
+                recorded: rates.recorded,
             },
             Some(Change::Restored) => EventKind::RatesRestored,
             None => return,

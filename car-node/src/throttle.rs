@@ -10,13 +10,21 @@ use synpf::Stamp;
 const SLOW: f64 = 0.25;
 /// ...once that has lasted [s].
 const SLOW_FOR: f64 = 2.0;
+/// Where sending less has not helped for so long, the full-rate streams for the recorder end, too [s]: over a link that
+/// cannot take them, they only keep what is live from coming through. They stay while nothing arrives at all: an outage is
+/// made good from the car's caches.
+const STILL_SLOW_FOR: f64 = 3.0;
 /// Poses that arrive sooner than this mean that the link has recovered [s]...
 const FAST: f64 = 0.1;
-/// ...once that has lasted [s].
+/// ...once that has lasted [s]...
 const FAST_FOR: f64 = 5.0;
+/// ...or longer, up to this, where the link was slow again as soon as everything was sent [s].
+const FAST_FOR_AT_MOST: f64 = 80.0;
+/// Slow again so soon means that it is sending everything that makes the link slow [s].
+const AGAIN: f64 = 20.0;
 /// A report counts for this long [s].
 const KEEP: f64 = 3.0;
-/// What is sent at most over a slow link. The full-rate streams for the recorder stay: a recording must be whole.
+/// What is sent at most over a slow link.
 const LOWERED: Rates = Rates {
     pose: 20.0,
     cloud: 2.0,
@@ -32,8 +40,8 @@ pub enum Change {
     Lowered {
         /// From publishing a pose to its arrival [s].
         transit: f64,
-        /// Poses per second, at most [Hz].
-        pose: f32,
+        /// What is sent at most.
+        rates: Rates,
     },
     /// The car sends what it was asked for.
     Restored,
@@ -46,7 +54,10 @@ pub struct Throttle {
     reports: VecDeque<(Stamp, f64)>,
     slow_since: Option<Stamp>,
     fast_since: Option<Stamp>,
-    lowered: bool,
+    /// What is sent at most; None for all that was asked for.
+    lowered: Option<Rates>,
+    /// When everything was last sent again, and how long the link had to be fast for it [s].
+    restored: Option<(Stamp, f64)>,
 }
 
 impl Throttle {
@@ -68,34 +79,49 @@ impl Throttle {
             }
             now.since(*since.get_or_insert(now)) >= time
         };
-        let slow = lasts(&mut self.slow_since, best > SLOW, SLOW_FOR);
-        let fast = lasts(&mut self.fast_since, best < FAST, FAST_FOR);
-        if slow && !self.lowered {
-            self.lowered = true;
-            Some(Change::Lowered {
-                transit: best,
-                pose: LOWERED.pose,
-            })
-        } else if fast && self.lowered {
-            self.lowered = false;
-            Some(Change::Restored)
+        let slow_for = if self.lowered.is_none() {
+            SLOW_FOR
         } else {
-            None
+            STILL_SLOW_FOR
+        };
+        let fast_for = self.restored.map_or(FAST_FOR, |(_, fast_for)| fast_for);
+        let slow = lasts(&mut self.slow_since, best > SLOW, slow_for);
+        let fast = lasts(&mut self.fast_since, best < FAST, fast_for);
+        let lowered = match self.lowered {
+            None if slow => LOWERED,
+            Some(rates) if slow && rates.recorded => Rates {
+                recorded: false,
+                ..LOWERED
+            },
+            Some(_) if fast => {
+                self.lowered = None;
+                self.restored = Some((now, fast_for));
+                return Some(Change::Restored);
+            }
+            _ => return None,
+        };
+        if self.lowered.is_none() {
+            let again = self.restored.filter(|(at, _)| now.since(*at) < AGAIN);
+            let fast_for = again.map_or(FAST_FOR, |(_, fast_for)| (2.0 * fast_for).min(FAST_FOR_AT_MOST));
+            self.restored = Some((now, fast_for));
         }
+        self.lowered = Some(lowered);
+        self.slow_since = None;
+        Some(Change::Lowered {
+            transit: best,
+            rates: lowered,
+        })
     }
 
     /// What is sent when `wanted` was asked for.
     pub fn rates(&self, wanted: Rates) -> Rates {
-        if !self.lowered {
-            return wanted;
-        }
-        Rates {
-            pose: wanted.pose.min(LOWERED.pose),
-            cloud: wanted.cloud.min(LOWERED.cloud),
-            scan: wanted.scan.min(LOWERED.scan),
-            health: wanted.health.min(LOWERED.health),
-            recorded: wanted.recorded,
-        }
+        self.lowered.map_or(wanted, |most| Rates {
+            pose: wanted.pose.min(most.pose),
+            cloud: wanted.cloud.min(most.cloud),
+            scan: wanted.scan.min(most.scan),
+            health: wanted.health.min(most.health),
+            recorded: wanted.recorded && most.recorded,
+        })
     }
 }
 
@@ -126,11 +152,15 @@ mod tests {
         assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
         let changes = report(&mut throttle, 10, 10, &[0.8]);
         assert!(
-            matches!(changes[..], [Change::Lowered { pose: 20.0, .. }]),
+            matches!(changes[..], [Change::Lowered { rates: first, .. }, Change::Lowered { rates: second, .. }]
+                if first.recorded && !second.recorded),
             "{changes:?}"
         );
         let lowered = throttle.rates(DEFAULT_RATES);
-        assert_eq!((lowered.pose, lowered.cloud, lowered.recorded), (20.0, 2.0, true));
+        assert_eq!(
+            (lowered.pose, lowered.cloud, lowered.recorded),
+            (20.0, 2.0, false)
+        );
         // What was asked to be less stays less.
         let quiet = Rates {
             pose: 5.0,
@@ -140,6 +170,22 @@ mod tests {
         assert_eq!(report(&mut throttle, 20, 4, &[0.15]), [], "neither slow nor fast");
         assert_eq!(report(&mut throttle, 24, 12, &[0.02]), [Change::Restored]);
         assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
+    }
+
+    #[test]
+    fn a_link_that_cannot_take_everything_is_tried_less_and_less_often() {
+        let mut throttle = Throttle::default();
+        let (mut now, mut tries) = (0, Vec::new());
+        while now < 400 {
+            // Slow while everything is sent, fast while it is not.
+            let transit = if throttle.lowered.is_some() { 0.02 } else { 0.6 };
+            if report(&mut throttle, now, 1, &[transit]) == [Change::Restored] {
+                tries.push(now);
+            }
+            now += 1;
+        }
+        let pauses: Vec<_> = tries.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        assert!(pauses.is_sorted() && pauses.last() > Some(&60), "{tries:?}");
     }
 
     #[test]

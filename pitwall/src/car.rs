@@ -69,6 +69,8 @@ impl ClockEstimate {
 impl Car {
     /// A car not heard of for this long is out of sight [ns].
     pub const BLIND_AFTER: i64 = 1_000_000_000;
+    /// A car that is there and is heard again within this time is on a starved link, and not silent on purpose [s].
+    const STARVED_AT_MOST: f64 = 10.0;
 
     /// A car first heard of at `at` [unix ns].
     pub fn new(name: CarName, at: i64) -> Self {
@@ -204,11 +206,24 @@ impl Car {
         self.clock.map_or(0, |clock| clock.offset)
     }
 
-    /// What this pit wall has to tell the car of its link at `now` [unix ns]; None while clocks are not compared, and
-    /// without a pose in the last second.
+    /// What this pit wall has to tell the car of its link at `now` [unix ns]; None while clocks are not compared, and when
+    /// nothing has come for long, as on purpose.
     pub fn link_report(&self, now: i64) -> Option<LinkReport> {
         let clock = self.clock?;
-        let (late, poses) = self.streams.get(&Topic::Pose)?.transit(now)?;
+        let streams = || {
+            [Topic::Pose, Topic::Health]
+                .into_iter()
+                .filter_map(|topic| self.streams.get(&topic))
+        };
+        let (late, poses) = streams().find_map(|stream| stream.transit(now)).or_else(|| {
+            // Nothing comes, but for signs of life: at least that late is what will.
+            let newest = streams()
+                .filter_map(Stream::newest)
+                .map(|header| header.published)
+                .max()?;
+            let late = (now - newest) as f64 * 1e-9;
+            (self.alive && late < Self::STARVED_AT_MOST).then_some((late, 0))
+        })?;
         Some(LinkReport {
             transit: (late + clock.offset as f64 * 1e-9) as f32,
             uncertainty: (clock.round_trip as f64 * 0.5e-9) as f32,

@@ -92,6 +92,9 @@ pub(crate) enum Verb {
         /// Views per second; 10 on a terminal, else 1.
         #[arg(long, value_name = "HZ")]
         rate: Option<f64>,
+        /// Wait so long for a car that is not there yet.
+        #[arg(long, value_name = "TIME", default_value = "10m", value_parser = duration)]
+        wait: Duration,
     },
     /// Look at a car's parameter sets, or change the one in force.
     Params {
@@ -129,6 +132,9 @@ pub(crate) enum Verb {
         /// Go on until interrupted.
         #[arg(long, short)]
         follow: bool,
+        /// With --follow: wait so long for a car that is not there yet.
+        #[arg(long, value_name = "TIME", default_value = "10m", value_parser = duration)]
+        wait: Duration,
     },
     /// Record all cars into an MCAP file, until interrupted.
     Record {

@@ -186,7 +186,7 @@ fn entry_of(event: &Event, car: &CarName, at: i64) -> LogEntry {
         EventKind::Lap { .. } => "lap",
         EventKind::SlipStarted { .. } | EventKind::SlipEnded { .. } => "slip",
         EventKind::Started { .. } | EventKind::Stopping { .. } | EventKind::SourceEnded => "node",
-        EventKind::RatesChanged | EventKind::RatesLowered { .. } | EventKind::RatesRestored => "rates",
+        EventKind::RatesChanged { .. } | EventKind::RatesLowered { .. } | EventKind::RatesRestored => "rates",
         EventKind::CommandRefused { .. } => "refused",
         EventKind::Warning { .. } => "warning",
         EventKind::Error { .. } => "error",

@@ -81,7 +81,7 @@ impl Role {
         let mut entries = vec![
             ("scouting/multicast/enabled", self.discoverable().to_string()),
             ("scouting/gossip/enabled", "false".to_owned()),
-            ("transport/link/tx/lease", "2000".to_owned()),
+            ("transport/link/tx/lease", "4000".to_owned()),
         ];
         match self {
             Self::Router { listen, .. } => {

@@ -151,7 +151,7 @@ fn config(endpoint: &str) -> Config {
         ("scouting/multicast/enabled", "false".to_owned()),
         ("scouting/gossip/enabled", "false".to_owned()),
         ("timestamping/enabled", "true".to_owned()),
-        ("transport/link/tx/lease", "2000".to_owned()),
+        ("transport/link/tx/lease", "4000".to_owned()),
     ] {
         config.insert_json5(key, &value).expect("a good setting");
     }

@@ -183,6 +183,12 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
         (&["events", "car-1"], 0, &["car-1", "lq", "mine", "[ana]"]),
         (&["events", "ghost"], 4, &["ghost"]),
         (&["cars", "--wait", "2s"], 0, &["car-1", "mute"]),
+        (
+            &["watch", "ghost", "--wait", "4s"],
+            4,
+            &["ghost is not there yet", "no such car: ghost"],
+        ),
+        (&["watch", "car-1", "--for", "2s"], 0, &["car-1"]),
     ];
     let mut wrong = Vec::new();
     for (words, expected, phrases) in table {

@@ -341,13 +341,14 @@ impl Clerk {
 
     fn initialize(&mut self, command: &Command, pose: Pose) -> Outcome {
         let (answer, answered) = bounded(1);
+        let before = self.believed().map(wire::pose2);
         match self
             .order(Order::Initialize { pose, answer }, &answered)
             .and_then(|taken| taken)
         {
             Ok(update) => {
                 let pose = wire::pose2(pose);
-                self.event(EventKind::PoseInitialized { pose }, Some(command));
+                self.event(EventKind::PoseInitialized { before, pose }, Some(command));
                 done(Some(update), Reply::Nothing)
             }
             Err(fault) => refused(fault),
@@ -413,15 +414,17 @@ impl Clerk {
             .rates
             .lock()
             .unwrap_or_else(PoisonError::into_inner);
-        if let RatesAction::Set(wanted) = action {
-            *rates = *wanted;
-        }
-        let now = *rates;
+        let from = *rates;
+        let to = match action {
+            RatesAction::Set(wanted) => *wanted,
+            RatesAction::Get => from,
+        };
+        *rates = to;
         drop(rates);
         if matches!(action, RatesAction::Set(_)) {
-            self.event(EventKind::RatesChanged, Some(command));
+            self.event(EventKind::RatesChanged { from, to }, Some(command));
         }
-        done(None, Reply::Rates(now))
+        done(None, Reply::Rates(to))
     }
 
     fn set_auto(&mut self, command: &Command, on: bool) -> Outcome {

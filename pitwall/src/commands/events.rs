@@ -6,7 +6,7 @@ use std::time::Duration;
 use pitwall::LogEntry;
 use protocol::{CarName, Severity};
 
-use super::{FIND, interrupted, open};
+use super::{interrupted, open};
 use crate::cli::LinkOptions;
 use crate::output;
 
@@ -14,11 +14,12 @@ pub(super) async fn run(
     link: &LinkOptions,
     car: Option<CarName>,
     follow: bool,
+    patience: Duration,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let hub = open(link).await?;
     if let Some(car) = &car
-        && !hub.wait_for(car, FIND).await
+        && !super::await_car(&hub, car, patience).await
     {
         return Ok(super::no_such_car(&hub, car).await);
     }

@@ -40,12 +40,23 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     };
     match verb {
         Verb::Cars { wait } => cars::run(&link, wait, json).await,
-        Verb::Watch { car, time, rate } => watch::run(&link, car, time, rate, json).await,
+        Verb::Watch {
+            car,
+            time,
+            rate,
+            wait,
+        } => {
+            let patience = time.map_or(wait, |time| time.min(wait));
+            watch::run(&link, car, time, rate, patience, json).await
+        }
         Verb::Params { car, verb } => params::run(&link, &car, verb, json).await,
         Verb::Locate { car, how } => steer::locate(&link, &car, &how, json).await,
         Verb::Rates { car, rates } => steer::rates(&link, &car, &rates, json).await,
         Verb::Auto { car, on } => steer::auto(&link, &car, on, json).await,
-        Verb::Events { car, follow } => events::run(&link, car, follow, json).await,
+        Verb::Events { car, follow, wait } => {
+            let patience = if follow { wait } else { FIND };
+            events::run(&link, car, follow, patience, json).await
+        }
         Verb::Record { output, time } => record::record(&link, &output, time, json).await,
         Verb::Replay { file, speed, at } => {
             let options = PageOptions {
@@ -64,6 +75,32 @@ async fn open(options: &LinkOptions) -> anyhow::Result<Arc<Hub>> {
     let role = Role::choose(&options.listen, &options.connect);
     tracing::info!("{role}");
     Ok(Hub::open(&role).await?)
+}
+
+/// Waits for a car, and says so where that takes longer than usual: the laptop is often started first. False when it is not
+/// there within `patience`, or when the program is asked to stop.
+async fn await_car(hub: &Hub, car: &CarName, patience: Duration) -> bool {
+    let usual = FIND.min(patience);
+    if hub.wait_for(car, usual).await {
+        return true;
+    }
+    let longer = patience.saturating_sub(usual);
+    if longer.is_zero() {
+        return false;
+    }
+    output::note(&format!(
+        "{car} is not there yet: waiting for it, {} s at most; Ctrl-C ends it",
+        longer.as_secs_f64().ceil()
+    ));
+    tokio::select! {
+        found = hub.wait_for(car, longer) => {
+            if found {
+                output::note(&format!("{car} is there"));
+            }
+            found
+        }
+        () = interrupted() => false,
+    }
 }
 
 /// Says that a car is not there.

@@ -116,11 +116,7 @@ pub(super) async fn tell(
                 }
             }
             Some(Reply::Rates(rates)) => {
-                let recorded = if rates.recorded { "on" } else { "off" };
-                output::say(&format!(
-                    "pose {} Hz, cloud {} Hz, scan {} Hz, health {} Hz, full-rate streams {recorded}",
-                    rates.pose, rates.cloud, rates.scan, rates.health
-                ));
+                output::say(&rates.to_string());
             }
             _ => {}
         }

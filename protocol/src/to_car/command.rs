@@ -134,6 +134,18 @@ impl Rates {
     pub const MAX: f32 = 1000.0;
 }
 
+impl fmt::Display for Rates {
+    /// `pose 20 Hz, cloud 10 Hz, scan 10 Hz, health 10 Hz, full-rate streams on`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let recorded = if self.recorded { "on" } else { "off" };
+        write!(
+            f,
+            "pose {} Hz, cloud {} Hz, scan {} Hz, health {} Hz, full-rate streams {recorded}",
+            self.pose, self.cloud, self.scan, self.health
+        )
+    }
+}
+
 impl Message for Command {
     const SCHEMA: Schema = Schema::Command;
 

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Cause, CommandId, Message, Pose2, Schema, Severity, State};
+use crate::{Cause, CommandId, Message, Pose2, Rates, Schema, Severity, State};
 
 /// Something that happened, at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -88,6 +88,8 @@ pub enum EventKind {
     },
     /// A pose to start from was given.
     PoseInitialized {
+        /// Where the car believed to be before, if it did.
+        before: Option<Pose2>,
         /// `map_from_base_link`.
         pose: Pose2,
     },
@@ -132,7 +134,12 @@ pub enum EventKind {
         on: bool,
     },
     /// The telemetry rates were changed.
-    RatesChanged,
+    RatesChanged {
+        /// Before.
+        from: Rates,
+        /// Now.
+        to: Rates,
+    },
     /// A command was refused.
     CommandRefused {
         /// Every fault.
@@ -173,6 +180,8 @@ pub enum EventKind {
         transit: f32,
         /// Poses per second now [Hz].
         pose: f32,
+        /// The full-rate streams for the recorder go on; if not, a recording has a hole in them that nothing fills.
+        recorded: bool,
     },
     /// The link has recovered: the car sends what it was asked for.
     RatesRestored,
@@ -240,7 +249,13 @@ impl fmt::Display for EventKind {
             }
             Self::SetStored { name } => write!(f, "set {name} stored"),
             Self::SetDeleted { name } => write!(f, "set {name} deleted"),
-            Self::PoseInitialized { pose: at } => write!(f, "initial pose {}", pose(at)),
+            Self::PoseInitialized { before, pose: at } => {
+                write!(f, "initial pose {}", pose(at))?;
+                match before {
+                    Some(before) => write!(f, ", was {}", pose(before)),
+                    None => Ok(()),
+                }
+            }
             Self::SearchStarted => f.write_str("searching the whole map"),
             Self::Relocalized { pose: at } => write!(f, "relocalized at {}", pose(at)),
             Self::Lap { lap, time, set } => match time {
@@ -259,17 +274,28 @@ impl fmt::Display for EventKind {
             Self::AutoChanged { on } => {
                 write!(f, "automatic switching {}", if *on { "on" } else { "off" })
             }
-            Self::RatesChanged => f.write_str("telemetry rates changed"),
+            Self::RatesChanged { from, to } => write!(f, "telemetry rates: {to}; were: {from}"),
             Self::CommandRefused { faults } => write!(f, "command refused: {}", faults.join("; ")),
             Self::SourceEnded => f.write_str("end of the sensor data"),
             Self::Warning { text } | Self::Error { text } => f.write_str(text),
             Self::ShadowStarted { set } => write!(f, "{set} runs in the shadow"),
             Self::ShadowEnded { set } => write!(f, "{set} no longer runs in the shadow"),
             Self::ShadowDropped { set, evidence } => write!(f, "shadow {set} dropped: {evidence}"),
-            Self::RatesLowered { transit, pose } => write!(
-                f,
-                "slow link, poses arrive after {transit:.2} s: sends {pose:.0} poses a second and less of the rest"
-            ),
+            Self::RatesLowered {
+                transit,
+                pose,
+                recorded,
+            } => {
+                let rest = if *recorded {
+                    "less of the rest"
+                } else {
+                    "no full-rate streams: recordings have a hole"
+                };
+                write!(
+                    f,
+                    "slow link, poses arrive after {transit:.2} s: sends {pose:.0} poses a second and {rest}"
+                )
+            }
             Self::RatesRestored => f.write_str("the link has recovered: sends as much as before"),
         }
     }
@@ -277,4 +303,6 @@ impl fmt::Display for EventKind {
 
 impl Message for Event {
     const SCHEMA: Schema = Schema::Event;
+    /// 2: what was before a new pose and new rates; whether the full-rate streams go on over a slow link.
+    const VERSION: u16 = 2;
 }

@@ -15,6 +15,13 @@ pub(crate) const TWIST: Twist2 = Twist2 {
     linear_y: 0.125,
     angular: -0.5,
 };
+const RATES: Rates = Rates {
+    pose: 1000.0,
+    cloud: 10.0,
+    scan: 10.0,
+    health: 10.0,
+    recorded: true,
+};
 pub(crate) const ID: CommandId = CommandId(0x0102_0304_0506_0708_090a_0b0c_0d0e_0f10);
 
 pub(crate) const CAUSE_KINDS: [CauseKind; 20] = [
@@ -264,7 +271,10 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
         EventKind::ParametersFellBack { from, to, update },
         EventKind::SetStored { name: name.clone() },
         EventKind::SetDeleted { name },
-        EventKind::PoseInitialized { pose: POSE },
+        EventKind::PoseInitialized {
+            before: Some(POSE),
+            pose: POSE,
+        },
         EventKind::SearchStarted,
         EventKind::Relocalized { pose: POSE },
         EventKind::Lap {
@@ -282,7 +292,10 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
             evidence: text.clone(),
         },
         EventKind::AutoChanged { on: true },
-        EventKind::RatesChanged,
+        EventKind::RatesChanged {
+            from: RATES,
+            to: Rates { pose: 20.0, ..RATES },
+        },
         EventKind::CommandRefused {
             faults: vec![text.clone()],
         },
@@ -298,6 +311,7 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
         EventKind::RatesLowered {
             transit: 0.5,
             pose: 20.0,
+            recorded: false,
         },
         EventKind::RatesRestored,
     ]

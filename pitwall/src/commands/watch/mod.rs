@@ -10,7 +10,7 @@ use std::time::Duration;
 use pitwall::{CarView, Hub, LogEntry, unix_now};
 use protocol::CarName;
 
-use super::{FIND, no_such_car, open, time_or_interrupt};
+use super::{FIND, await_car, no_such_car, open, time_or_interrupt};
 use crate::cli::LinkOptions;
 use crate::output;
 
@@ -19,6 +19,7 @@ pub(super) async fn run(
     car: Option<CarName>,
     time: Option<Duration>,
     rate: Option<f64>,
+    patience: Duration,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let screen = !json && output::on_terminal();
@@ -29,7 +30,7 @@ pub(super) async fn run(
         .ok_or_else(|| anyhow::anyhow!("--rate {rate}: not a rate"))?;
     let hub = open(link).await?;
     if let Some(car) = &car
-        && !hub.wait_for(car, FIND).await
+        && !await_car(&hub, car, patience).await
     {
         return Ok(no_such_car(&hub, car).await);
     }

@@ -56,8 +56,8 @@ impl Quality {
                 y + sin * point[0] + cos * point[1],
             );
             let distance = field
-                .nearest(px * cells, py * cells)
-                .map_or(1.0, |d| d.abs().min(1.0));
+                .from_wall(px * cells, py * cells)
+                .map_or(1.0, |d| d.min(1.0));
             count += 1.0;
             residual += distance;
             if distance < ALIGNED {

@@ -160,6 +160,8 @@ fn accumulate(
         let w = 1.0 / (1.0 + ratio * ratio);
         let w = w * w;
         let [gx, gy] = sample.gradient;
+        // Steeper than distances are: the field jumps here, and there is no wall.
+        let w = if gx * gx + gy * gy > 2.5 { 0.0 } else { w };
         let gh = dx * gy - dy * gx;
         let (wx, wy, wh, d) = (w * gx, w * gy, w * gh, distance);
         for (sum, term) in sums.iter_mut().zip([

@@ -10,17 +10,19 @@ use protocol::{
     LinkReport, MapReply, Message, Outcome, Stamps, Topic, decode, encode,
 };
 use serde::Serialize;
+use tokio::sync::mpsc;
 use zenoh::query::ConsolidationMode;
 
 use crate::event::Happening;
 use crate::link::{ASK_CONGESTION, ASK_PRIORITY, Link, unix_now};
 
-/// How long a car may take to answer.
-pub const PATIENCE: Duration = Duration::from_secs(2);
+/// How long a car may take to answer: as long as a link may be silent before it counts as cut.
+pub const PATIENCE: Duration = Duration::from_secs(4);
 /// A command that is not answered for so long is sent again: the radio may have lost it, or its answer.
 const REPEAT: Duration = Duration::from_millis(500);
-/// Between two attempts that end at once, as they do while a car restarts.
-const BREATH: Duration = Duration::from_millis(50);
+/// A car that has not been seen for so long since it was asked is not there. Asked once is not enough: over a slow link,
+/// or on a laptop that has just started, the answer that it is there may be on its way.
+const ABSENT: Duration = Duration::from_millis(2500);
 
 /// What became of a command, as the operator sees it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -51,6 +53,22 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// What a car's reply to a command says.
+    fn of(command: &Command, reply: &[u8], after: Duration) -> Self {
+        match decode::<Answer>(reply) {
+            Ok((_, answer)) if answer.id == command.id => Self::Answered {
+                answer,
+                after_s: after.as_secs_f64(),
+            },
+            Ok((_, answer)) => Self::Unreadable {
+                error: format!("it answers command {} instead of {}", answer.id, command.id),
+            },
+            Err(error) => Self::Unreadable {
+                error: error.to_string(),
+            },
+        }
+    }
+
     /// The exit code of a program that gave the command: 0 done, 3 refused, 4 no such car, 5 no answer, 6 stale
     /// revision.
     pub fn exit_code(&self) -> u8 {
@@ -141,39 +159,76 @@ impl Link {
     ) -> Result<Verdict, CodecError> {
         let begun = Instant::now();
         let bytes = encode(command, stamps())?;
-        let mut was_there = false;
+        // Every copy may still be answered after the next one was sent: on a slow link an answer takes longer than that.
+        let (answers, mut answered) = mpsc::unbounded_channel();
+        let (mut was_there, mut there) = (false, true);
+        let mut presence = Box::pin(self.alive_after(Duration::ZERO, car));
         loop {
             let left = patience.saturating_sub(begun.elapsed());
-            let (there, answer) = tokio::join!(
-                self.alive(car),
-                self.ask::<Answer>(car, command.action.topic(), bytes.clone(), left.min(REPEAT))
-            );
-            let waited_s = begun.elapsed().as_secs_f64();
-            match answer {
-                Ok(Some(answer)) if answer.id == command.id => {
-                    return Ok(Verdict::Answered {
-                        answer,
-                        after_s: waited_s,
-                    });
+            self.pose(car, command.action.topic(), bytes.clone(), left, &answers)
+                .await;
+            let again = tokio::time::sleep(REPEAT.min(left));
+            tokio::pin!(again);
+            loop {
+                tokio::select! {
+                    biased;
+                    Some(bytes) = answered.recv() => {
+                        return Ok(Verdict::of(command, &bytes, begun.elapsed()));
+                    }
+                    seen = &mut presence => {
+                        (was_there, there) = (was_there || seen, seen);
+                        presence = Box::pin(self.alive_after(REPEAT, car));
+                    }
+                    () = &mut again => break,
                 }
-                Ok(Some(answer)) => {
-                    return Ok(Verdict::Unreadable {
-                        error: format!("it answers command {} instead of {}", answer.id, command.id),
-                    });
-                }
-                Err(error) => return Ok(Verdict::Unreadable { error }),
-                // It never was there to take the command in.
-                Ok(None) if !there && !was_there => return Ok(Verdict::NoSuchCar),
-                Ok(None) if begun.elapsed() >= patience => {
-                    return Ok(Verdict::NoAnswer {
-                        waited_s,
-                        gone: !there,
-                    });
-                }
-                Ok(None) => was_there = true,
             }
-            tokio::time::sleep(BREATH).await;
+            let waited = begun.elapsed();
+            if waited >= patience && was_there {
+                return Ok(Verdict::NoAnswer {
+                    waited_s: waited.as_secs_f64(),
+                    gone: !there,
+                });
+            }
+            if waited >= ABSENT.min(patience) && !was_there {
+                return Ok(Verdict::NoSuchCar);
+            }
         }
+    }
+
+    /// Poses a question of which every answer, within `patience`, goes to `answers`.
+    async fn pose(
+        &self,
+        car: &CarName,
+        topic: Topic,
+        question: Vec<u8>,
+        patience: Duration,
+        answers: &mpsc::UnboundedSender<Vec<u8>>,
+    ) {
+        let key = Key::new(car.clone(), topic).to_string();
+        let answers = answers.clone();
+        let sent = self
+            .session
+            .get(&key)
+            .payload(question)
+            .timeout(patience)
+            .consolidation(ConsolidationMode::None)
+            .congestion_control(ASK_CONGESTION)
+            .priority(ASK_PRIORITY)
+            .callback(move |reply| match reply.into_result() {
+                // Nobody waits any more after the first.
+                Ok(sample) => drop(answers.send(sample.payload().to_bytes().into_owned())),
+                Err(error) => tracing::debug!(?error, "an error in place of a reply"),
+            })
+            .await;
+        if let Err(error) = sent {
+            tracing::debug!(%key, %error, "the question could not be sent");
+        }
+    }
+
+    /// The same, asked after a pause.
+    async fn alive_after(&self, pause: Duration, car: &CarName) -> bool {
+        tokio::time::sleep(pause).await;
+        self.alive(car).await
     }
 
     /// True when the car's node runs.
@@ -183,7 +238,7 @@ impl Link {
             .session
             .liveliness()
             .get(&key)
-            .timeout(Duration::from_secs(1))
+            .timeout(Duration::from_secs(2))
             .await
         else {
             return false;

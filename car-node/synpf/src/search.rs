@@ -200,19 +200,12 @@ impl Search {
         // One scan often fits several places of a large map, and where something stands in view or the map is out of
         // date, another one better: a pose that explains the scan in good part is not given up for that, unless the fit
         // has fallen from one scan to the next, or is worse than usual while the other place explains as much as usual.
-        let usual = usual.map(|least| INDEPENDENT * least.max(0.02).ln());
-        let as_usual = usual.is_some_and(|usual| best.score >= usual);
+        let as_usual = usual.is_some_and(|least| best.score >= INDEPENDENT * least.max(0.02).ln());
         if explains(own) && !sudden && !as_usual {
             return None;
         }
         let elsewhere = !same(best.estimate.pose, pose);
-        let most = parameters.search.search_margin;
-        // Along a straight a wrong place fits nearly as well as the right one; that the fit fell is evidence as well.
-        let margin = match usual {
-            Some(usual) if as_usual => (0.5 * (usual - own)).clamp(0.25 * most, most),
-            _ => most,
-        };
-        (elsewhere && best.score >= own + margin).then_some(search)
+        (elsewhere && best.score >= own + parameters.search.search_margin).then_some(search)
     }
 }
 

@@ -2,8 +2,7 @@
 //!
 //! A good map is fitted the same all along a drive, to a few per cent. A pose that is wrong along a straight still has most
 //! end points on walls, so that no limit on alignment shows it, but the fit falls by many times its own variation, from one
-//! scan to the next, or by a few and stays there: evidence of that is summed up (Page's cumulative sum; Biometrika 41,
-//! 1954). On a map that fits badly the variation is large, from place to place too, and such falls say nothing.
+//! scan to the next. On a map that fits badly the variation is large, and the same fall says nothing.
 
 use crate::recovery::RecoveryParameters;
 
@@ -13,10 +12,8 @@ pub(crate) struct Surprise {
     /// Mean fit and mean distance from it, over the long term.
     usual: Option<[f64; 2]>,
     scans: u32,
-    /// Scans on end that fitted much worse than usual.
+    /// Scans on end that fitted worse than usual.
     worse: u32,
-    /// By how many variations in all the scans of late fitted worse than is common.
-    evidence: f64,
 }
 
 /// Scans until the usual fit is known.
@@ -24,16 +21,6 @@ const KNOWN: u32 = 80;
 
 /// Scans on end before it is a surprise.
 const ON_END: u32 = 2;
-
-/// So many variations below the mean are common, on end too: maps differ from place to place...
-const COMMON: f64 = 1.5;
-
-/// ...and so many beyond that, summed up, are not: on the logs at hand a right pose reaches 8 where the map is good, and a
-/// wrong one passes 12 within 0.3 s of its fit falling.
-const ENOUGH: f64 = 12.0;
-
-/// Only a map that scans usually fit at least so well is as good all over; a worse one is wrong about whole rooms.
-const GOOD: f64 = 0.88;
 
 /// Variation is never taken for smaller than this: 60 beams cannot tell less.
 const LEAST_VARIATION: f64 = 0.008;
@@ -43,21 +30,8 @@ impl Surprise {
     pub(crate) fn push(&mut self, fit: f64, parameters: &RecoveryParameters) {
         let [mean, variation] = *self.usual.get_or_insert([fit, 0.05]);
         self.scans = self.scans.saturating_add(1);
-        if self.scans > KNOWN {
-            let below = (mean - fit) / variation.max(LEAST_VARIATION);
-            self.worse = if below > parameters.surprise {
-                self.worse + 1
-            } else {
-                0
-            };
-            // One scan alone is never enough, and what is long past neither.
-            let step = below.min(parameters.surprise) - COMMON;
-            self.evidence = if mean < GOOD {
-                0.0
-            } else {
-                (self.evidence + step).clamp(0.0, 2.0 * ENOUGH)
-            };
-        }
+        let worse = self.scans > KNOWN && fit < mean - parameters.surprise * variation.max(LEAST_VARIATION);
+        self.worse = if worse { self.worse + 1 } else { 0 };
         let alpha = parameters.alpha_slow.max(1.0 / f64::from(self.scans));
         let off = (fit - mean).abs();
         self.usual = Some([mean + alpha * (fit - mean), variation + alpha * (off - variation)]);
@@ -65,8 +39,7 @@ impl Surprise {
 
     /// The least fit that is still usual; None while nothing is a surprise.
     pub(crate) fn least(&self) -> Option<f64> {
-        let surprised = self.worse >= ON_END || self.evidence > ENOUGH;
-        let [mean, variation] = self.usual.filter(|_| surprised)?;
+        let [mean, variation] = self.usual.filter(|_| self.worse >= ON_END)?;
         Some(mean - 2.0 * variation.max(LEAST_VARIATION))
     }
 }
@@ -102,18 +75,6 @@ mod tests {
             None,
             "the map is fitted no better than that anyway"
         );
-    }
-
-    #[test]
-    fn a_slight_fall_that_stays_is_a_surprise_too() {
-        let falls =
-            |by: f64| steady(0.01).chain((0..40).map(move |scan| 0.94 - by + 0.01 * f64::from(scan % 2)));
-        // Three variations down, 1.5 of them beyond what is common: 12 are reached within ten scans.
-        let noticed = first(falls(0.035)).expect("a surprise");
-        assert!((404..415).contains(&noticed), "{noticed}");
-        assert_eq!(first(falls(0.015)), None);
-        let worse_map = falls(0.035).map(|fit| fit - 0.1);
-        assert_eq!(first(worse_map), None, "it is wrong about whole rooms");
     }
 
     #[test]

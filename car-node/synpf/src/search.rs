@@ -196,7 +196,10 @@ impl Search {
         };
         search.rank(parameters.search.search_candidates);
         let best = search.candidates.first()?;
-        let own = score(map, scan, pose);
+        // At the end of a straight a pose is often a little too far on or back. That is the filter's to mend.
+        let own = (-NEARBY..=NEARBY)
+            .map(|step| score(map, scan, pose * Pose::new(0.1 * f64::from(step), 0.0, 0.0)))
+            .fold(f64::MIN, f64::max);
         // One scan often fits several places of a large map, and where something stands in view or the map is out of
         // date, another one better: a pose that explains the scan in good part is not given up for that, unless the fit
         // has fallen from one scan to the next, or is worse than usual while the other place explains as much as usual.
@@ -208,6 +211,9 @@ impl Search {
         (elsewhere && best.score >= own + parameters.search.search_margin).then_some(search)
     }
 }
+
+/// A pose may be wrong by this much along its heading without being another place [0.1 m].
+const NEARBY: i32 = 6;
 
 /// Whether a score is that of a pose which explains a scan, at least in good part.
 fn explains(score: f64) -> bool {

@@ -276,8 +276,13 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{again:?}");
+        let Verdict::Answered { answer, .. } = again else {
+            panic!("{again:?}");
+        };
+        assert_eq!(answer.set.name, name);
+        // Its revision too: selecting the same set again is a change of its own.
         wait_until("the set that was wanted", || {
-            in_force(&hub, &real).is_some_and(|(set, _)| set == name)
+            in_force(&hub, &real) == Some((name.to_owned(), answer.set.revision))
         })
         .await;
     }

@@ -335,25 +335,11 @@ impl Link {
         question: Vec<u8>,
         patience: Duration,
     ) -> Option<Vec<u8>> {
-        let key = Key::new(car.clone(), topic).to_string();
-        let replies = self
-            .session
-            .get(&key)
-            .payload(question)
-            .timeout(patience)
-            .consolidation(ConsolidationMode::None)
-            .congestion_control(ASK_CONGESTION)
-            .priority(ASK_PRIORITY)
-            .await
-            .inspect_err(|error| tracing::debug!(%key, %error, "the question could not be sent"))
-            .ok()?;
-        while let Ok(reply) = replies.recv_async().await {
-            match reply.into_result() {
-                Ok(sample) => return Some(sample.payload().to_bytes().into_owned()),
-                Err(error) => tracing::debug!(%key, ?error, "an error in place of a reply"),
-            }
-        }
-        None
+        let (answers, mut answered) = mpsc::unbounded_channel();
+        self.pose(car, topic, question, patience, &answers).await;
+        // With the last sender, which the question holds until it is answered or given up, the wait ends.
+        drop(answers);
+        answered.recv().await
     }
 }
 

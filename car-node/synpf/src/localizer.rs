@@ -384,12 +384,12 @@ impl Localizer {
                     .update(&self.map, &self.scan, motion, seconds, &self.parameters);
                 if let Some(estimate) = found {
                     self.start(estimate, [0.1, 0.1, 0.05]);
-                    return Ok(self.report(scan.stamp, twist, None, [0.0; 2]));
+                    return Ok(self.report(scan.stamp, twist, None, Pose::IDENTITY));
                 }
                 if let Some(best) = self.search.candidates.first() {
                     self.estimate = best.estimate;
                 }
-                return Ok(self.report(scan.stamp, twist, None, [0.0; 2]));
+                return Ok(self.report(scan.stamp, twist, None, Pose::IDENTITY));
             }
         }
         let update = self.follow(scan.stamp, seconds, motion, twist);
@@ -440,10 +440,7 @@ impl Localizer {
             };
         }
         self.learn_walls(motion);
-        let innovation = [
-            self.estimate.pose.distance(predicted.pose),
-            maps::wrap_angle(self.estimate.pose.heading - predicted.pose.heading).abs(),
-        ];
+        let innovation = self.estimate.pose.since(predicted.pose);
         if seconds > 0.0 {
             self.slip_window
                 .push(stamp, seconds, wheels, motion, self.estimate.pose.since(before));
@@ -566,7 +563,7 @@ impl Localizer {
         stamp: Stamp,
         twist: Twist,
         belief: Option<(Belief, f64)>,
-        innovation: [f64; 2],
+        innovation: Pose,
     ) -> Update {
         self.number += 1;
         let quality = Quality::new(
@@ -587,8 +584,9 @@ impl Localizer {
             self.w_ratio = self
                 .doubt
                 .push(quality.clear_alignment().max(0.02), quality.alignment, recovery);
-            self.surprise
-                .push(fit_of(&self.map, &self.scan, self.estimate.pose), recovery);
+            let correction = [innovation.y.abs(), innovation.heading.abs()];
+            let fit = fit_of(&self.map, &self.scan, self.estimate.pose);
+            self.surprise.push(fit, correction, recovery);
             let lost = self.settled > 10
                 && self.doubt.lost(
                     quality.clear_alignment(),
@@ -623,7 +621,7 @@ impl Localizer {
             long_beams: quality.long,
             no_return: self.scan.no_return,
             w_ratio: self.w_ratio,
-            innovation,
+            innovation: [innovation.x.hypot(innovation.y), innovation.heading.abs()],
             slip: self.slip.ratio,
             yaw_rate_residual: self.slip.yaw_rate,
         }
@@ -634,7 +632,7 @@ impl Localizer {
         if !self.doubt.asks(
             quality.clear_alignment(),
             self.w_ratio,
-            self.surprise.least().is_some(),
+            self.surprise.fall().is_some(),
             seconds,
             &self.parameters.recovery,
         ) {
@@ -645,7 +643,7 @@ impl Localizer {
             &self.scan,
             self.estimate.pose,
             self.doubt.sudden(),
-            self.surprise.least(),
+            self.surprise.fall(),
             &self.parameters,
         ) {
             Some(search) => {
@@ -730,7 +728,7 @@ impl Localizer {
     fn latest_of_odometry(&mut self) -> Result<Update, Dropped> {
         self.per_odometry.have_scan = true;
         let last = self.per_odometry.last.ok_or(Dropped::NoOdometry)?;
-        Ok(self.report(last.stamp, last.twist, None, [0.0; 2]))
+        Ok(self.report(last.stamp, last.twist, None, Pose::IDENTITY))
     }
 
     /// The latest posterior carried forward to `stamp` by the odometry since, for publishing at odometry rate.

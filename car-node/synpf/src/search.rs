@@ -16,6 +16,7 @@ use crate::TrackMap;
 use crate::beams::ReadyScan;
 use crate::parameters::{Check, Parameters};
 use crate::refine::{Estimate, fit, refine};
+use crate::surprise::Fall;
 
 /// Parameters of the search.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -181,13 +182,13 @@ impl Search {
     }
 
     /// Looks for a pose elsewhere that explains a scan clearly better than `pose` does; with what was found, a
-    /// search can begin. `usual` is the least fit that scans usually have, where this one is below it.
+    /// search can begin. `fall` says that the scan fits worse than usual.
     pub(crate) fn second_opinion(
         map: &TrackMap,
         scan: &ReadyScan,
         pose: Pose,
         sudden: bool,
-        usual: Option<f64>,
+        fall: Option<Fall>,
         parameters: &Parameters,
     ) -> Option<Self> {
         let mut search = Self {
@@ -197,18 +198,41 @@ impl Search {
         search.rank(parameters.search.search_candidates);
         let best = search.candidates.first()?;
         // At the end of a straight a pose is often a little too far on or back. That is the filter's to mend.
+        // And it has as much of a chance to follow this scan as the candidates have.
+        let freely = fitted(map, scan, pose, parameters);
         let own = (-NEARBY..=NEARBY)
-            .map(|step| score(map, scan, pose * Pose::new(0.1 * f64::from(step), 0.0, 0.0)))
+            .flat_map(|step| {
+                [pose, freely.pose].map(|pose| pose * Pose::new(0.1 * f64::from(step), 0.0, 0.0))
+            })
+            .map(|pose| score(map, scan, pose))
             .fold(f64::MIN, f64::max);
         // One scan often fits several places of a large map, and where something stands in view or the map is out of
         // date, another one better: a pose that explains the scan in good part is not given up for that, unless the fit
         // has fallen from one scan to the next, or is worse than usual while the other place explains as much as usual.
-        let as_usual = usual.is_some_and(|least| best.score >= INDEPENDENT * least.max(0.02).ln());
+        let usual = fall.map(|fall| INDEPENDENT * fall.least.max(0.02).ln());
+        let as_usual = usual.is_some_and(|usual| best.score >= usual);
         if explains(own) && !sudden && !as_usual {
             return None;
         }
         let elsewhere = !same(best.estimate.pose, pose);
-        (elsewhere && best.score >= own + parameters.search.search_margin).then_some(search)
+        let most = parameters.search.search_margin;
+        // Along a straight a wrong place fits nearly as well as the right one; that the pose jumped is evidence as well.
+        let margin = match usual {
+            Some(usual) if as_usual && fall.is_some_and(|fall| fall.jumped) => {
+                (0.5 * (usual - own)).clamp(0.15 * most, most)
+            }
+            _ => most,
+        };
+        if !elsewhere || best.score < own + margin {
+            return None;
+        }
+        // It may be right after all.
+        search.candidates.push(Candidate {
+            estimate: freely,
+            score: score(map, scan, freely.pose),
+            scans: 1,
+        });
+        Some(search)
     }
 }
 
@@ -223,6 +247,22 @@ fn explains(score: f64) -> bool {
 /// How well a scan's end points lie on walls at a pose, in [0, 1]: what scores are made of.
 pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
     fit(map.field(), &scan.points, BEAMS, pose, 0.08)
+}
+
+/// The fit of a scan near a pose that is known only coarsely.
+fn fitted(map: &TrackMap, scan: &ReadyScan, pose: Pose, parameters: &Parameters) -> Estimate {
+    let prior = Estimate {
+        pose,
+        covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
+    };
+    refine(
+        map.field(),
+        &scan.points,
+        pose,
+        &prior,
+        0.0,
+        &parameters.refinement,
+    )
 }
 
 fn same(a: Pose, b: Pose) -> bool {
@@ -387,15 +427,10 @@ fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candid
             }
         }
     }
-    let spread = Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01));
     picked
         .into_par_iter()
         .map(|pose| {
-            let prior = Estimate {
-                pose,
-                covariance: spread,
-            };
-            let estimate = refine(field, &scan.points, pose, &prior, 0.0, &parameters.refinement);
+            let estimate = fitted(map, scan, pose, parameters);
             Candidate {
                 estimate,
                 score: score(map, scan, estimate.pose),

@@ -1,8 +1,8 @@
 //! The raceline: of all lines between the walls, the one that bends least.
 
 use maps::{Raceline, RacelineFault};
-use nalgebra::{DMatrix, DVector};
 
+use super::ring::Ring;
 use super::spline::{normals, resample};
 use crate::Walls;
 
@@ -97,48 +97,54 @@ fn room(
 }
 
 /// The moves that make the sum of squared curvatures least.
-fn solve(points: &[[f64; 2]], normals: &[[f64; 2]], bounds: &[[f64; 2]]) -> DVector<f64> {
+fn solve(points: &[[f64; 2]], normals: &[[f64; 2]], bounds: &[[f64; 2]]) -> Vec<f64> {
     let n = points.len();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
     // Curvature at i is the second difference of the points along the normal there: constant + row * moves.
-    let mut hessian = DMatrix::<f64>::identity(n, n) * 1e-6;
-    let mut linear = DVector::<f64>::zeros(n);
+    let mut hessian = Ring::diagonal(n, 1e-6);
+    let mut linear = vec![0.0; n];
     for i in 0..n {
         let (before, after) = ((i + n - 1) % n, (i + 1) % n);
         let stencil = [(before, 1.0), (i, -2.0), (after, 1.0)];
         let constant: f64 = stencil.iter().map(|&(k, w)| w * dot(points[k], normals[i])).sum();
         let row = stencil.map(|(k, w)| (k, w * dot(normals[k], normals[i])));
-        for (a, wa) in row {
-            linear[a] += wa * constant;
-            for (b, wb) in row {
-                hessian[(a, b)] += wa * wb;
-            }
+        for (k, w) in row {
+            linear[k] += w * constant;
         }
+        hessian.add_square(before, row.map(|(_, w)| w));
     }
-    let clamp = |moves: DVector<f64>| DVector::from_fn(n, |i, _| moves[i].clamp(bounds[i][0], bounds[i][1]));
-    let cost = |moves: &DVector<f64>| 0.5 * moves.dot(&(&hessian * moves)) + linear.dot(moves);
-    let mut moves = clamp(DVector::zeros(n));
+    let clamped = |moves: &[f64]| -> Vec<f64> {
+        let pairs = moves.iter().zip(bounds);
+        pairs.map(|(v, [least, most])| v.clamp(*least, *most)).collect()
+    };
+    let sum = |a: &[f64], b: &[f64]| -> f64 { a.iter().zip(b).map(|(a, b)| a * b).sum() };
+    let cost = |moves: &[f64]| 0.5 * sum(moves, &hessian.times(moves)) + sum(&linear, moves);
+    let mut moves = clamped(&vec![0.0; n]);
     for _ in 0..30 {
-        let gradient = &hessian * &moves + &linear;
+        let gradient: Vec<f64> = hessian
+            .times(&moves)
+            .iter()
+            .zip(&linear)
+            .map(|(a, b)| a + b)
+            .collect();
         // Points held by a wall that they press against stay; all others take a Newton step.
-        let free: Vec<usize> = (0..n)
-            .filter(|&i| {
-                !(moves[i] <= bounds[i][0] && gradient[i] > 0.0
-                    || moves[i] >= bounds[i][1] && gradient[i] < 0.0)
+        let held: Vec<bool> = (0..n)
+            .map(|i| {
+                moves[i] <= bounds[i][0] && gradient[i] > 0.0 || moves[i] >= bounds[i][1] && gradient[i] < 0.0
             })
             .collect();
-        let reduced = DMatrix::from_fn(free.len(), free.len(), |a, b| hessian[(free[a], free[b])]);
-        let right = DVector::from_fn(free.len(), |a, _| -gradient[free[a]]);
-        let Some(factor) = reduced.cholesky() else { break };
-        let step = factor.solve(&right);
+        let Some(back) = hessian.solve(&gradient, &held) else {
+            break;
+        };
         let before = cost(&moves);
         let mut length = 1.0;
         let improved = loop {
-            let mut next = moves.clone();
-            for (a, &i) in free.iter().enumerate() {
-                next[i] += length * step[a];
-            }
-            let next = clamp(next);
+            let next: Vec<f64> = moves
+                .iter()
+                .zip(&back)
+                .map(|(v, step)| v - length * step)
+                .collect();
+            let next = clamped(&next);
             let gain = before - cost(&next);
             if gain > 0.0 {
                 moves = next;

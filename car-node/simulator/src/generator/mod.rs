@@ -3,6 +3,7 @@
 mod mapping;
 mod minimum_curvature;
 mod random;
+mod ring;
 mod spec;
 mod speed_profile;
 mod spline;

@@ -18,7 +18,7 @@ pub const BUNDLED: [&str; 4] = ["club", "hall", "park", "mirror"];
 const SPACING: f64 = 0.05;
 /// Control points are at least so far apart [m].
 const CLOSEST: f64 = 0.1;
-/// Longest lap from control point to control point [m]: the raceline's equations are dense, and club tracks reach 540 m.
+/// Longest lap from control point to control point [m]: club tracks reach 540 m.
 const LONGEST: f64 = 600.0;
 
 /// A track, described: everything else is generated from it, the same every time.

@@ -1,5 +1,9 @@
 //! Closed curves through points.
 
+use super::ring::LEAST;
+#[cfg(doc)]
+use super::ring::Ring;
+
 /// Points between two control points before resampling.
 const STEPS: usize = 100;
 
@@ -31,12 +35,12 @@ pub(crate) fn curve_and_knots(control: &[[f64; 2]], spacing: f64) -> (Vec<[f64; 
     (curve, knots)
 }
 
-/// A closed polyline's points moved to equal distances of about `spacing` [m].
+/// A closed polyline's points moved to equal distances of about `spacing` [m]; at least as many as make a [`Ring`].
 pub(crate) fn resample(points: &[[f64; 2]], spacing: f64) -> Vec<[f64; 2]> {
     let n = points.len();
     let lengths: Vec<f64> = (0..n).map(|i| distance(points[i], points[(i + 1) % n])).collect();
     let total: f64 = lengths.iter().sum();
-    let count = (total / spacing).round().max(3.0) as usize;
+    let count = ((total / spacing).round() as usize).max(LEAST);
     let mut resampled = Vec::with_capacity(count);
     let (mut segment, mut passed) = (0, 0.0);
     for k in 0..count {

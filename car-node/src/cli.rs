@@ -211,9 +211,13 @@ pub(crate) struct Ablate {
 /// Arguments of `race`.
 #[derive(Debug, Args)]
 pub(crate) struct Race {
-    /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
+    /// Track: club, hall, park, mirror, a folder, or a map.yaml of your own.
     #[arg(long, value_name = "NAME|FOLDER|MAP.yaml", default_value = "club")]
     pub(crate) track: String,
+    /// Its raceline: CSV, or race_stack's global_waypoints.json [default: raceline.csv beside the map]. On a map of your own
+    /// it is slowed to what the simulated car can do.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) raceline: Option<PathBuf>,
     /// Laps for every car.
     #[arg(long, value_name = "N", default_value = "10", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) laps: u32,
@@ -296,18 +300,18 @@ pub(crate) enum TrackCommand {
     },
     /// Check that a track can be raced on: exit code 1 and every fault if not.
     Check {
-        /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
-        #[arg(value_name = "NAME|FOLDER|MAP.yaml")]
-        track: String,
+        /// Which track.
+        #[command(flatten)]
+        track: TrackArguments,
         /// One JSON object on stdout.
         #[arg(long)]
         json: bool,
     },
     /// Draw a track in the terminal, or as an SVG file.
     Draw {
-        /// Track: club, hall, park, mirror, a folder, or a map.yaml with a raceline.csv beside it.
-        #[arg(value_name = "NAME|FOLDER|MAP.yaml")]
-        track: String,
+        /// Which track.
+        #[command(flatten)]
+        track: TrackArguments,
         /// Write an SVG file: walls, map and raceline coloured by speed.
         #[arg(long, value_name = "FILE.svg")]
         svg: Option<PathBuf>,
@@ -315,6 +319,17 @@ pub(crate) enum TrackCommand {
         #[arg(long, value_name = "N", default_value = "100", value_parser = clap::value_parser!(u16).range(20..=400))]
         columns: u16,
     },
+}
+
+/// A track that is there.
+#[derive(Debug, Args)]
+pub(crate) struct TrackArguments {
+    /// Track: club, hall, park, mirror, a folder, or a map.yaml of your own.
+    #[arg(value_name = "NAME|FOLDER|MAP.yaml")]
+    pub(crate) track: String,
+    /// Its raceline [default: raceline.csv beside the map].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) raceline: Option<PathBuf>,
 }
 
 /// A number within a range, or what the range is.

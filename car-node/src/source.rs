@@ -14,7 +14,7 @@ use synpf::{Stamp, Twist};
 
 pub use bag_player::BagPlayer;
 pub use ros2::{Ros2, Ros2Error, Ros2Options};
-pub use simulated::{Incident, Race, ScriptedIncident, SimulatedCar};
+pub use simulated::{Incident, Race, Script, ScriptedIncident, SimulatedCar};
 
 use crate::bag::SensorEvent;
 use crate::clock::SensorClock;

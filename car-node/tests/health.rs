@@ -16,7 +16,7 @@ use synpf::{Localizer, Parameters, TrackMap};
 
 fn club() -> Track {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
-    Track::load(tracks.join("club")).expect("bundled")
+    Track::load(tracks.join("club"), None).expect("bundled")
 }
 
 /// The log of one car of a race, driven on the filter's estimates for `moving` of `seconds` [s]. A driver that never gets

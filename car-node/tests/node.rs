@@ -116,7 +116,7 @@ fn tracks() -> PathBuf {
 }
 
 fn start(name: &str, wall: &Wall, change: impl FnOnce(&mut NodeConfig)) -> (Node, CarName) {
-    let track = Track::load(tracks().join("club")).expect("bundled");
+    let track = Track::load(tracks().join("club"), None).expect("bundled");
     let map = RaceMap {
         name: track.name.clone(),
         map: Arc::new(TrackMap::new(track.grid.clone()).expect("free cells")),

@@ -185,7 +185,7 @@ fn options(endpoint: &str) -> Ros2Options {
 fn localizes(naming: Naming) {
     let (ros_router, ros_endpoint) = router();
     let (_wall, wall_endpoint) = router();
-    let track = Track::find("club").expect("bundled");
+    let track = Track::find("club", None).expect("bundled");
     let (drive, start) = drive(&ros_router, naming, &track);
 
     let until = Instant::now() + DEADLINE;

@@ -25,7 +25,7 @@ pub(crate) const KNOCK: Duration = Duration::from_secs(80);
 
 /// Starts every car; the last one reaches the wall by `radio`.
 pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>> {
-    let track = Track::find(&options.track)?;
+    let track = Track::find(&options.track, None)?;
     let map = RaceMap {
         name: track.name.clone(),
         map: Arc::new(TrackMap::new(track.grid.clone())?),

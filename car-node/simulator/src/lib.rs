@@ -20,7 +20,7 @@
 //! # let wall = |radius| Wall { surface: Surface::Plain, points: circle(radius) };
 //! # let track = Track { name: "ring".into(), grid, raceline: Raceline::through(&circle(4.0)[..60], 3.0)?,
 //! #     walls: Walls::new(vec![wall(3.0), wall(5.0)]) };
-//! // let track = Track::load("maps/tracks/club")?;
+//! // let track = Track::load("maps/tracks/club", None)?;
 //! let mut world = World::new(Arc::new(track), &[CarSetup::default()], 42);
 //! let mut laps = 0;
 //! while laps < 2 {
@@ -61,7 +61,7 @@ pub use check::TrackReport;
 pub use driver::{Ahead, Driver, DriverParams, Estimate, Manoeuvre};
 pub use generator::{
     BUNDLED, BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map,
-    minimum_curvature, speed_profile,
+    minimum_curvature, slowed_to, speed_profile,
 };
 pub use lidar::{Lidar, LidarParams, Obstacle, Scan};
 pub use odometry::{Gyro, Motion, Odometry, OdometryParams, OdometrySensor, YawSource};

@@ -6,7 +6,8 @@ use std::path::Path;
 
 use maps::{MapError, OccupancyGrid, Raceline};
 
-use crate::Walls;
+use crate::generator::slowed_to;
+use crate::{SpeedParams, Walls};
 
 /// A track to race on.
 #[derive(Debug, Clone)]
@@ -22,9 +23,12 @@ pub struct Track {
 }
 
 impl Track {
-    /// Reads `map.yaml`, `raceline.csv` and `walls.csv` from a folder, or a map file and what lies beside it. Without
-    /// `walls.csv`, as for the map of a real track, the walls are taken from the map.
-    pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
+    /// Reads `map.yaml`, `raceline.csv` and `walls.csv` from a folder, or a map file and what lies beside it. `raceline`
+    /// names another file for the line, in any format that [`Raceline::parse`] reads.
+    ///
+    /// Without `walls.csv`, as for the map of a real track, the walls are taken from the map, and the raceline, which was
+    /// made for another car, is slowed to what ours can do ([`SpeedParams::default`]).
+    pub fn load(path: impl AsRef<Path>, raceline: Option<&Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
         let (folder, map) = if path.is_dir() {
             (path, path.join("map.yaml"))
@@ -32,7 +36,8 @@ impl Track {
             (path.parent().unwrap_or(Path::new("")), path.to_owned())
         };
         let grid = OccupancyGrid::load(map)?;
-        let raceline = Raceline::load(folder.join("raceline.csv"))?;
+        let beside = folder.join("raceline.csv");
+        let mut line = Raceline::load(raceline.unwrap_or(&beside))?;
         let walls = folder.join("walls.csv");
         let walls = if walls.exists() {
             let file = walls.display().to_string();
@@ -41,6 +46,7 @@ impl Track {
                 Err(source) => return Err(MapError::Read { file, source }),
             }
         } else {
+            line = slowed_to(&line, &SpeedParams::default());
             Walls::from_grid(&grid)
         };
         let name = folder
@@ -49,7 +55,7 @@ impl Track {
         Ok(Self {
             name: name.into_owned(),
             grid,
-            raceline,
+            raceline: line,
             walls,
         })
     }
@@ -126,12 +132,15 @@ impl Track {
         })
     }
 
-    /// A bundled track by name, or else the one at that path.
-    pub fn find(name_or_path: &str) -> Result<Self, MapError> {
-        match Self::bundled(name_or_path) {
-            Some(track) => Ok(track),
-            None => Self::load(name_or_path),
+    /// A bundled track by name, or else the one at that path ([`Track::load`]).
+    pub fn find(name_or_path: &str, raceline: Option<&Path>) -> Result<Self, MapError> {
+        let Some(mut track) = Self::bundled(name_or_path) else {
+            return Self::load(name_or_path, raceline);
+        };
+        if let Some(path) = raceline {
+            track.raceline = Raceline::load(path)?;
         }
+        Ok(track)
     }
 }
 
@@ -170,7 +179,7 @@ mod tests {
             names(&free),
             ["map.png", "map.yaml", "raceline.csv", "track.yaml", "walls.csv"]
         );
-        let back = Track::load(&free).expect("what was written");
+        let back = Track::load(&free, None).expect("what was written");
         assert_eq!(back.grid.cells, track.grid.cells);
         fs::remove_dir_all(&place).expect("our own folder");
     }

@@ -14,7 +14,7 @@ fn folder(name: &str) -> PathBuf {
 #[test]
 fn every_bundled_track_can_be_raced_on() {
     for name in BUNDLED {
-        let track = Track::load(folder(name)).expect("a bundled track");
+        let track = Track::load(folder(name), None).expect("a bundled track");
         assert_eq!(track.name, name);
         for p in track.raceline.points() {
             assert_eq!(track.grid.at([p.x, p.y]), Cell::Free, "{name}: {p:?}");
@@ -36,7 +36,7 @@ fn the_bundled_club_is_what_its_description_makes() {
         .expect("a valid description")
         .generate()
         .expect("room enough");
-    let kept = Track::load(folder("club")).expect("a bundled track");
+    let kept = Track::load(folder("club"), None).expect("a bundled track");
     // As read back, because the bytes of a PNG depend on the compressor that the build has picked.
     let made_grid = OccupancyGrid::from_parts(&made.grid.to_yaml("map.png"), &made.grid.to_png());
     assert!(

@@ -80,13 +80,13 @@ fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
     Ok(set)
 }
 
-/// A bundled track, or the one in a folder.
-fn find_track(name_or_path: &str) -> anyhow::Result<Track> {
+/// A bundled track, or the one at a path; `raceline` names a file for its line.
+fn find_track(name_or_path: &str, raceline: Option<&Path>) -> anyhow::Result<Track> {
     if !BUNDLED.contains(&name_or_path) && !Path::new(name_or_path).exists() {
         let bundled = BUNDLED.join(", ");
         bail!("no track {name_or_path:?}: neither a folder or a file nor one of {bundled}");
     }
-    Ok(Track::find(name_or_path)?)
+    Ok(Track::find(name_or_path, raceline)?)
 }
 
 /// Says why a command failed: each cause once, though some libraries repeat their source's words in their own.

@@ -8,7 +8,7 @@ use car_node::race::{CarResult, Guide, MeanSigma, PAPER_ROWS, Quality, RaceSetup
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
-use simulator::Track;
+use simulator::{Track, TrackReport};
 use synpf::{Parameters, TrackMap};
 
 use super::{find_track, load_set};
@@ -29,7 +29,10 @@ struct Report {
 }
 
 pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
-    let track = Arc::new(find_track(&arguments.track)?);
+    let track = Arc::new(find_track(&arguments.track, arguments.raceline.as_deref())?);
+    for fault in TrackReport::of(&track).faults {
+        eprintln!("car-node: warning: {}: {fault}", arguments.track);
+    }
     let map = TrackMap::new(track.grid.clone()).with_context(|| arguments.track.clone())?;
     let map = Arc::new(map);
     if arguments.table {
@@ -289,6 +292,16 @@ fn print_one(report: &Report) {
     );
     line("alignment, paper's", or_dash(s.alignment_paper, 100.0, 2), "%");
     line("alignment, ours", or_dash(s.alignment, 100.0, 2), "%");
+    if !s.states.is_empty() {
+        let shares = s.states.iter().map(|(state, share)| {
+            let state = format!("{state:?}").to_uppercase();
+            format!("{state} {:.2} %", share * 100.0)
+        });
+        line("states", shares.collect::<Vec<_>>().join(", "), "");
+        line("LOST though right", s.false_lost.to_string(), "updates");
+        line("LOCALIZED though wrong", s.false_localized.to_string(), "updates");
+        line("searches", s.searches.to_string(), "");
+    }
     line("crashes", s.crashes.to_string(), "");
     line("scrapes", s.scrapes.to_string(), "");
     line("collisions", s.collisions.to_string(), "");

@@ -12,7 +12,7 @@ use car_node::ros_pose;
 use car_node::source::{BagPlayer, Belief, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
-use simulator::{CarSetup, Grip, OdometryParams, Track, YawSource};
+use simulator::{CarSetup, Grip, OdometryParams, YawSource};
 use synpf::TrackMap;
 
 use crate::cli::{Odometry, Run, SourceKind};
@@ -45,7 +45,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             (map, Box::new(source), Begin::Global)
         }
         (SourceKind::Simulator, _) => {
-            let track = Track::find(&arguments.map.to_string_lossy())?;
+            let track = super::find_track(&arguments.map.to_string_lossy(), arguments.raceline.as_deref())?;
             let map = race_map(
                 track.name.clone(),
                 track.grid.clone(),

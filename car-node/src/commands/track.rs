@@ -28,9 +28,12 @@ pub(crate) fn run(command: &TrackCommand) -> anyhow::Result<()> {
             };
             new(folder, &spec, &text, *force, *json)
         }
-        TrackCommand::Check { track, json } => check(&find_track(track)?, *json),
+        TrackCommand::Check { track, json } => {
+            check(&find_track(&track.track, track.raceline.as_deref())?, *json)
+        }
         TrackCommand::Draw { track, svg, columns } => {
-            draw(&find_track(track)?, svg.as_deref(), (*columns).into())
+            let track = find_track(&track.track, track.raceline.as_deref())?;
+            draw(&track, svg.as_deref(), (*columns).into())
         }
     }
 }

@@ -132,6 +132,11 @@ impl States {
         &self.changes
     }
 
+    /// How often a state was entered.
+    pub fn entered(&self, state: State) -> usize {
+        self.changes.iter().filter(|change| change.state == state).count()
+    }
+
     /// Share of the updates in each state.
     pub fn shares(&self) -> BTreeMap<State, f64> {
         let all: usize = self.counts.values().sum();

@@ -1,15 +1,17 @@
 //! What is noted during a race, and what is said of it afterwards.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use maps::Pose;
 use serde::Serialize;
 use simulator::Track;
-use synpf::{Scan, TrackMap};
+use synpf::{Scan, Stamp, TrackMap};
 
 use super::paper_alignment;
-use crate::evaluate::{PoseErrors, Summaries, mean, percentile};
+use crate::evaluate::{PoseErrors, StateTruth, States, Summaries, mean, percentile};
+use crate::health::State;
 
 /// One finished lap.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -37,6 +39,39 @@ pub struct LoadSummary {
     pub real_time_factor: f64,
 }
 
+/// What went wrong with a car.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MishapKind {
+    /// It hit a wall and had to be put back.
+    Crash,
+    /// It touched a wall and went on.
+    Scrape,
+    /// It touched another car.
+    Collision,
+    /// It turned round.
+    Spin,
+}
+
+/// Something that went wrong, with what tells the cause.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Mishap {
+    /// When, since the start of the race [s].
+    pub at_s: f64,
+    /// What.
+    pub kind: MishapKind,
+    /// Where along the raceline [m].
+    pub s_m: f64,
+    /// How far beside it, left positive [m].
+    pub d_m: f64,
+    /// Speed into what was touched [m/s].
+    pub impact_mps: f64,
+    /// False when the car was being turned round.
+    pub racing: bool,
+    /// How far off the estimate was at the last scan; None without one [m].
+    pub pose_error_m: Option<f64>,
+}
+
 /// One car's race.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CarResult {
@@ -52,10 +87,18 @@ pub struct CarResult {
     pub collisions: u32,
     /// Times it turned round.
     pub spins: u32,
+    /// All of these, in order.
+    pub mishaps: Vec<Mishap>,
     /// Estimate against truth, at the scans' stamps, the first 2 s left out; None when nothing was estimated.
     pub pose_error: Option<Summaries>,
     /// Mean scan alignment by the localizer's own definition (0.10 m), in [0, 1]; None where there is no localizer.
     pub alignment: Option<f64>,
+    /// Share of the updates in each health state; empty where there is no localizer.
+    pub states: BTreeMap<State, f64>,
+    /// What the states were worth.
+    pub state_truth: Option<StateTruth>,
+    /// Times the localizer gave its pose up and searched the map.
+    pub searches: usize,
     /// How long the race took [s].
     pub race_s: f64,
     /// Measured on this machine: differs from run to run.
@@ -109,6 +152,14 @@ pub struct RaceSummary {
     pub alignment_paper: Option<f64>,
     /// Scan alignment by ours, in [0, 1].
     pub alignment: Option<f64>,
+    /// Share of the updates in each health state; empty where there is no localizer.
+    pub states: BTreeMap<State, f64>,
+    /// Updates of all cars that were LOST though within 0.2 m and 2 deg of the truth.
+    pub false_lost: usize,
+    /// Updates of all cars that were LOCALIZED though further off than 1 m.
+    pub false_localized: usize,
+    /// Searches of the map by all cars.
+    pub searches: usize,
     /// Crashes of all cars.
     pub crashes: u32,
     /// Scrapes of all cars.
@@ -133,6 +184,15 @@ impl RaceSummary {
         let load = |value: fn(&LoadSummary) -> f64| {
             mean(&cars.iter().map(|car| value(&car.load)).collect::<Vec<_>>()).unwrap_or_default()
         };
+        let mut states: BTreeMap<State, f64> = BTreeMap::new();
+        let watched = cars.iter().filter(|car| !car.states.is_empty()).count();
+        for (state, share) in cars.iter().flat_map(|car| &car.states) {
+            *states.entry(*state).or_default() += share / watched as f64;
+        }
+        let wrong = |count: fn(&StateTruth) -> usize| {
+            let judged = cars.iter().filter_map(|car| car.state_truth.as_ref());
+            judged.map(count).sum()
+        };
         let aligned: Vec<f64> = cars.iter().filter_map(|car| car.alignment).collect();
         Self {
             finished: cars.iter().filter(|car| car.finished).count(),
@@ -146,6 +206,10 @@ impl RaceSummary {
             heading_rmse_rad: rms(|e| e.heading_error_rad.rmse),
             alignment_paper: mean(&over_laps(|lap| lap.alignment_paper)),
             alignment: mean(&aligned),
+            states,
+            false_lost: wrong(|truth| truth.false_lost),
+            false_localized: wrong(|truth| truth.false_localized),
+            searches: cars.iter().map(|car| car.searches).sum(),
             crashes: cars.iter().map(|car| car.crashes).sum(),
             scrapes: cars.iter().map(|car| car.scrapes).sum(),
             collisions: cars.iter().map(|car| car.collisions).sum(),
@@ -165,13 +229,13 @@ pub(super) struct Recorder {
     track: Arc<Track>,
     map: Arc<TrackMap>,
     finished: Vec<LapRecord>,
-    pub(super) crashes: u32,
-    pub(super) scrapes: u32,
-    pub(super) collisions: u32,
-    pub(super) spins: u32,
+    mishaps: Vec<Mishap>,
+    /// How far off the estimate was at the last scan [m].
+    pose_error: Option<f64>,
     /// Past the start line for the first time; the way there belongs to no lap.
     pub(super) on_a_lap: bool,
     pose_errors: PoseErrors,
+    states: States,
     /// Of the lap being driven: distances of estimate and car from the line, alignments.
     line_errors: Vec<f64>,
     true_line_errors: Vec<f64>,
@@ -187,12 +251,11 @@ impl Recorder {
             track,
             map,
             finished: Vec::new(),
-            crashes: 0,
-            scrapes: 0,
-            collisions: 0,
-            spins: 0,
+            mishaps: Vec::new(),
+            pose_error: None,
             on_a_lap: false,
             pose_errors: PoseErrors::default(),
+            states: States::default(),
             line_errors: Vec::new(),
             true_line_errors: Vec::new(),
             alignments_paper: Vec::new(),
@@ -244,6 +307,7 @@ impl Recorder {
         base_link_from_laser: Pose,
     ) {
         self.pose_errors.push(scan.stamp, estimate, truth);
+        self.pose_error = truth.map(|truth| estimate.distance(truth));
         if !self.on_a_lap {
             return;
         }
@@ -255,6 +319,19 @@ impl Recorder {
             base_link_from_laser,
         ));
         self.alignments.extend(alignment);
+    }
+
+    /// What the health state said of the estimate at a scan's stamp.
+    pub(super) fn judged(&mut self, stamp: Stamp, state: State, estimate: Pose, truth: Option<Pose>) {
+        self.states.push(stamp, state, estimate, truth);
+    }
+
+    /// Something went wrong; how far off the estimate was is added.
+    pub(super) fn mishap(&mut self, mishap: Mishap) {
+        self.mishaps.push(Mishap {
+            pose_error_m: self.pose_error,
+            ..mishap
+        });
     }
 
     /// A lap is over.
@@ -270,18 +347,24 @@ impl Recorder {
         self.finished.push(lap);
     }
 
-    pub(super) fn result(mut self, race: Duration, elapsed: Duration, laps: u32) -> CarResult {
-        let finished = self.finished.len() >= laps as usize;
-        self.finished.truncate(laps as usize);
+    pub(super) fn result(mut self, race: Duration, elapsed: Duration, laps: Option<u32>) -> CarResult {
+        let laps = laps.map_or(self.finished.len(), |laps| laps as usize);
+        let finished = self.finished.len() >= laps;
+        self.finished.truncate(laps);
+        let count = |kind| self.mishaps.iter().filter(|mishap| mishap.kind == kind).count() as u32;
         CarResult {
             finished,
             laps: self.finished,
-            crashes: self.crashes,
-            scrapes: self.scrapes,
-            collisions: self.collisions,
-            spins: self.spins,
+            crashes: count(MishapKind::Crash),
+            scrapes: count(MishapKind::Scrape),
+            collisions: count(MishapKind::Collision),
+            spins: count(MishapKind::Spin),
+            mishaps: self.mishaps,
             pose_error: self.pose_errors.summaries(),
             alignment: mean(&self.alignments),
+            states: self.states.shares(),
+            state_truth: self.states.truth(),
+            searches: self.states.entered(State::Relocalizing),
             race_s: race.as_secs_f64(),
             load: LoadSummary {
                 cpu: self.busy.as_secs_f64() / race.as_secs_f64(),

@@ -13,13 +13,16 @@ use std::time::{Duration, Instant};
 
 use maps::{Pose, wrap_angle};
 use serde::{Deserialize, Serialize};
-use simulator::{CarSetup, Estimate, Grip, Message, TICK, Track, World};
+use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
+
 use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
-pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, RaceSummary};
+pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, Mishap, MishapKind, RaceSummary};
 pub use paper::{PAPER_ROWS, PaperRow};
 
+use crate::health::{Monitor, Thresholds};
+use crate::source::{Script, ScriptedIncident};
 use metrics::Recorder;
 
 /// What tells the driver where the car is.
@@ -88,29 +91,68 @@ pub fn race(
     map: &Arc<TrackMap>,
     setup: &RaceSetup,
 ) -> Result<Vec<CarResult>, SetUpError> {
+    let expected = f64::from(setup.laps) * track.lap_time() / setup.speed_scale;
+    let end = End {
+        laps: Some(setup.laps),
+        time: Duration::from_secs_f64(10.0 + 4.0 * expected),
+    };
+    run(
+        track,
+        map,
+        &field(setup),
+        Vec::new(),
+        &setup.guide,
+        end,
+        setup.seed,
+    )
+}
+
+/// When a race is over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct End {
+    /// When all cars have driven so many laps; None waits for the time.
+    pub laps: Option<u32>,
+    /// After this long at the latest.
+    pub time: Duration,
+}
+
+/// The cars of a race.
+fn field(setup: &RaceSetup) -> Vec<CarSetup> {
     let mut car = CarSetup::default();
     car.vehicle = car.vehicle.with_grip(setup.quality.grip());
     car.driver.speed_scale = setup.speed_scale * setup.quality.speed_scale();
-    let setups: Vec<CarSetup> = (0..setup.cars)
+    (0..setup.cars)
         .map(|index| CarSetup {
             start: car.start - GRID_GAP * index as f64,
             ..car
         })
-        .collect();
-    let mut world = World::new(Arc::clone(track), &setups, setup.seed);
-    let mut crews = (0..setup.cars)
-        .map(|index| Crew::new(&world, index, map, setup, &car))
+        .collect()
+}
+
+/// Runs a race of any cars, to which things may happen. Cars that go by the truth have no localizer, whatever `guide` says.
+pub fn run(
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    setups: &[CarSetup],
+    script: Vec<ScriptedIncident>,
+    guide: &Guide,
+    end: End,
+    seed: u64,
+) -> Result<Vec<CarResult>, SetUpError> {
+    let mut world = World::new(Arc::clone(track), setups, seed);
+    let mut script = Script::new(script);
+    let mut crews = (0..)
+        .zip(setups)
+        .map(|(index, car)| Crew::new(&world, index, map, guide, car, seed))
         .collect::<Result<Vec<_>, _>>()?;
 
     let begin = Instant::now();
-    let limit =
-        Duration::from_secs_f64(10.0 + 4.0 * f64::from(setup.laps) * track.lap_time() / setup.speed_scale);
     let done = |crews: &[Crew]| {
-        crews
-            .iter()
-            .all(|crew| crew.recorder.laps() >= setup.laps as usize)
+        end.laps
+            .is_some_and(|laps| crews.iter().all(|crew| crew.recorder.laps() >= laps as usize))
     };
-    while !done(&crews) && world.now() < limit {
+    while !done(&crews) && world.now() < end.time {
+        script.play(&mut world);
         for output in world.step() {
             let index = output.car;
             if let Some(estimate) = crews[index].take_in(&world, index, &output.message) {
@@ -121,7 +163,7 @@ pub fn race(
     let elapsed = begin.elapsed();
     Ok(crews
         .into_iter()
-        .map(|crew| crew.recorder.result(world.now(), elapsed, setup.laps))
+        .map(|crew| crew.recorder.result(world.now(), elapsed, end.laps))
         .collect())
 }
 
@@ -136,7 +178,7 @@ struct Crew {
 }
 
 enum RunningGuide {
-    SynPf(Box<Localizer>),
+    SynPf(Box<Localizer>, Box<Monitor>),
     /// `map_from_odom`, once it is known.
     Odometry(Option<Pose>, Pose),
     Truth,
@@ -147,20 +189,24 @@ impl Crew {
         world: &World,
         index: usize,
         map: &Arc<TrackMap>,
-        setup: &RaceSetup,
+        guide: &Guide,
         car: &CarSetup,
+        seed: u64,
     ) -> Result<Self, SetUpError> {
         let start = world.truth(index).pose;
         let base_link_from_laser = car.lidar.base_link_from_laser;
-        let guide = match &setup.guide {
+        let guide = match guide {
+            _ if car.guidance == Guidance::Truth => RunningGuide::Truth,
             Guide::SynPf(parameters) => {
-                let seed = setup.seed.wrapping_add(index as u64);
+                let seed = seed.wrapping_add(index as u64);
                 let parameters = Parameters::clone(parameters);
                 // A car's tables are ready before it starts.
                 map.prepare(Some(start), &parameters);
                 let mut localizer = Localizer::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
                 localizer.initialize(start)?;
-                RunningGuide::SynPf(Box::new(localizer))
+                let mut monitor = Monitor::new(Thresholds::default(), stamp(world.now()));
+                monitor.on_new_pose(stamp(world.now()));
+                RunningGuide::SynPf(Box::new(localizer), Box::new(monitor))
             }
             Guide::Odometry => RunningGuide::Odometry(None, start),
             Guide::Truth => RunningGuide::Truth,
@@ -190,7 +236,7 @@ impl Crew {
                 })
             }
             Message::Gyro(gyro) => {
-                if let RunningGuide::SynPf(localizer) = &mut self.guide {
+                if let RunningGuide::SynPf(localizer, _) = &mut self.guide {
                     let reading = YawRate {
                         stamp: stamp(gyro.stamp),
                         rate: gyro.yaw_rate,
@@ -200,7 +246,7 @@ impl Crew {
                 None
             }
             Message::Scan(scan) => {
-                let pose = self.on_scan(scan)?;
+                let pose = self.on_scan(scan, stamp(world.now()))?;
                 let latest = self.latest?;
                 Some(Estimate {
                     time: latest.stamp,
@@ -219,8 +265,9 @@ impl Crew {
             Message::Placed(pose) => {
                 // The crew tells the localizer where the marshals put the car.
                 match &mut self.guide {
-                    RunningGuide::SynPf(localizer) => {
+                    RunningGuide::SynPf(localizer, monitor) => {
                         localizer.initialize(*pose).ok();
+                        monitor.on_new_pose(stamp(world.now()));
                     }
                     RunningGuide::Odometry(map_from_odom, start) => (*map_from_odom, *start) = (None, *pose),
                     RunningGuide::Truth => {}
@@ -231,29 +278,37 @@ impl Crew {
                 self.recorder.lap(lap.time);
                 None
             }
-            Message::Crash(_) => {
-                self.recorder.crashes += 1;
-                None
-            }
-            Message::Scrape(_) => {
-                self.recorder.scrapes += 1;
-                None
-            }
-            Message::Collision(_) => {
-                self.recorder.collisions += 1;
-                None
-            }
-            Message::Spin => {
-                self.recorder.spins += 1;
-                None
-            }
+            Message::Crash(contact) => self.mishap(world, index, MishapKind::Crash, contact.impact),
+            Message::Scrape(contact) => self.mishap(world, index, MishapKind::Scrape, contact.impact),
+            Message::Collision(contact) => self.mishap(world, index, MishapKind::Collision, contact.impact),
+            Message::Spin => self.mishap(world, index, MishapKind::Spin, 0.0),
         }
+    }
+
+    /// Notes what went wrong. There is no estimate in it.
+    fn mishap(&mut self, world: &World, index: usize, kind: MishapKind, impact: f64) -> Option<Estimate> {
+        let manoeuvre = world.manoeuvre(index);
+        let [at, s, d] = {
+            let truth = world.truth(index);
+            [truth.stamp.as_secs_f64(), truth.track.s, truth.track.d]
+        };
+        self.recorder.mishap(Mishap {
+            at_s: at,
+            kind,
+            s_m: s,
+            d_m: d,
+            impact_mps: impact,
+            racing: manoeuvre == Manoeuvre::Racing,
+            pose_error_m: None,
+        });
+        None
     }
 
     /// `map_from_base_link` at the odometry's stamp.
     fn on_odometry(&mut self, odometry: &simulator::Odometry, world: &World, index: usize) -> Option<Pose> {
         match &mut self.guide {
-            RunningGuide::SynPf(localizer) => {
+            RunningGuide::SynPf(localizer, monitor) => {
+                monitor.on_odometry(stamp(world.now()));
                 let message = Odometry {
                     stamp: stamp(odometry.stamp),
                     pose: odometry.pose,
@@ -277,7 +332,7 @@ impl Crew {
     }
 
     /// Lets the localizer take in a scan and notes how good it is. Returns the pose now, if the scan changed it.
-    fn on_scan(&mut self, scan: &simulator::Scan) -> Option<Pose> {
+    fn on_scan(&mut self, scan: &simulator::Scan, now: Stamp) -> Option<Pose> {
         let message = Scan {
             stamp: stamp(scan.stamp),
             angle_min: scan.angle_min,
@@ -288,7 +343,7 @@ impl Crew {
             ranges: scan.ranges.clone(),
         };
         let truth = self.truth_at(message.stamp);
-        let RunningGuide::SynPf(localizer) = &mut self.guide else {
+        let RunningGuide::SynPf(localizer, monitor) = &mut self.guide else {
             // What has no opinion of scans is judged by where it says the car is, or the truth.
             let pose = match &self.guide {
                 RunningGuide::Odometry(map_from_odom, _) => {
@@ -306,7 +361,12 @@ impl Crew {
                 .scanned(&message, pose, twist, truth, None, self.base_link_from_laser);
             return None;
         };
-        let update = self.recorder.timed_update(|| localizer.on_scan(&message)).ok()?;
+        let Ok(update) = self.recorder.timed_update(|| localizer.on_scan(&message)) else {
+            monitor.on_refused_scan(now);
+            return None;
+        };
+        let state = monitor.on_update(&update, now).state;
+        self.recorder.judged(update.stamp, state, update.pose, truth);
         let twist = [update.twist.linear_x, update.twist.angular];
         self.recorder.scanned(
             &message,
@@ -344,10 +404,12 @@ pub const RACE_TICK: Duration = TICK;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::health::State;
+    use crate::source::Incident;
 
     fn club() -> (Arc<Track>, Arc<TrackMap>) {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../maps/tracks/club");
-        let track = Track::load(folder).expect("a bundled track");
+        let track = Track::load(folder, None).expect("a bundled track");
         let map = TrackMap::new(track.grid.clone()).expect("a map with free space");
         (Arc::new(track), Arc::new(map))
     }
@@ -375,6 +437,40 @@ mod tests {
         // The truth is never wrong, but for how it is interpolated.
         let errors = car.pose_error.expect("errors");
         assert!(errors.position_error_m.max < 0.005);
+    }
+
+    #[test]
+    fn a_race_tells_its_states_and_what_went_wrong_with_its_cause() {
+        let (track, map) = club();
+        let parameters = Box::new(Parameters::named("hq").expect("ships"));
+        let setup = setup(Guide::SynPf(parameters), 1, 1);
+        let knock = ScriptedIncident {
+            at: Duration::from_secs(6),
+            car: 0,
+            incident: Incident::Knock(15.0),
+        };
+        let end = End {
+            laps: None,
+            time: Duration::from_secs(9),
+        };
+        let results = run(&track, &map, &field(&setup), vec![knock], &setup.guide, end, 1).expect("a race");
+        let [car] = &results[..] else { panic!("one car") };
+        let spin = car.mishaps.iter().find(|mishap| mishap.kind == MishapKind::Spin);
+        let spin = spin.expect("15 rad/s turn any car round");
+        assert!((6.0..7.0).contains(&spin.at_s), "{spin:?}");
+        assert!(spin.pose_error_m.is_some_and(|error| error < 0.3), "{spin:?}");
+        assert_eq!(
+            car.spins as usize,
+            car.mishaps.iter().filter(|m| m.kind == MishapKind::Spin).count()
+        );
+        let all: f64 = car.states.values().sum();
+        assert!(
+            (all - 1.0).abs() < 1e-9 && car.states[&State::Localized] > 0.5,
+            "{:?}",
+            car.states
+        );
+        let summary = RaceSummary::of(&results);
+        assert_eq!(summary.states, car.states);
     }
 
     #[test]

@@ -34,14 +34,41 @@ pub struct ScriptedIncident {
     pub incident: Incident,
 }
 
+/// Incidents that are still to come.
+#[derive(Debug)]
+pub struct Script {
+    /// The next one last.
+    rest: Vec<ScriptedIncident>,
+}
+
+impl Script {
+    /// Incidents in any order.
+    pub fn new(mut incidents: Vec<ScriptedIncident>) -> Self {
+        incidents.sort_by_key(|incident| std::cmp::Reverse(incident.at));
+        Self { rest: incidents }
+    }
+
+    /// Lets all happen that is due.
+    pub fn play(&mut self, world: &mut World) {
+        while let Some(&ScriptedIncident { at, car, incident }) = self.rest.last()
+            && at <= world.now()
+        {
+            match incident {
+                Incident::Grip(grip) => world.set_grip(car, grip),
+                Incident::Knock(yaw_rate) => world.knock(car, yaw_rate),
+            }
+            self.rest.pop();
+        }
+    }
+}
+
 /// What the cars share.
 #[derive(Debug)]
 struct Shared {
     world: World,
     /// What each car has not yet picked up.
     queues: Vec<VecDeque<(Stamp, Feed)>>,
-    /// What is still to come, the next one last.
-    script: Vec<ScriptedIncident>,
+    script: Script,
 }
 
 /// A race of one car or several, in real time.
@@ -63,19 +90,13 @@ const TOO_LATE: f64 = 0.5;
 
 impl Race {
     /// A race that has not begun. `script` need not be in order.
-    pub fn new(
-        track: Track,
-        setups: Vec<CarSetup>,
-        seed: u64,
-        mut script: Vec<ScriptedIncident>,
-    ) -> Arc<Self> {
-        script.sort_by_key(|incident| std::cmp::Reverse(incident.at));
+    pub fn new(track: Track, setups: Vec<CarSetup>, seed: u64, script: Vec<ScriptedIncident>) -> Arc<Self> {
         let track = Arc::new(track);
         Arc::new(Self {
             shared: Mutex::new(Shared {
                 world: World::new(Arc::clone(&track), &setups, seed),
                 queues: setups.iter().map(|_| VecDeque::new()).collect(),
-                script,
+                script: Script::new(script),
             }),
             clock: OnceLock::new(),
             epoch: wall_now(),
@@ -152,15 +173,8 @@ impl Source for SimulatedCar {
                     return Next::Due(due, feed);
                 }
             }
-            let now = shared.world.now();
-            while shared.script.last().is_some_and(|incident| incident.at <= now) {
-                if let Some(ScriptedIncident { car, incident, .. }) = shared.script.pop() {
-                    match incident {
-                        Incident::Grip(grip) => shared.world.set_grip(car, grip),
-                        Incident::Knock(yaw_rate) => shared.world.knock(car, yaw_rate),
-                    }
-                }
-            }
+            let Shared { world, script, .. } = &mut *shared;
+            script.play(world);
             for output in shared.world.step() {
                 let due = race.stamp(output.at);
                 let queue = &mut shared.queues[output.car];

@@ -11,4 +11,4 @@ mod spline;
 pub use mapping::{MappingParams, draw_map};
 pub use minimum_curvature::{LineError, minimum_curvature};
 pub use spec::{BUNDLED, BlackStretch, Block, TrackSpec};
-pub use speed_profile::{SpeedParams, speed_profile};
+pub use speed_profile::{SpeedParams, slowed_to, speed_profile};

@@ -33,6 +33,15 @@ impl Default for SpeedParams {
 /// The line with the speeds of a car that uses the acceleration it may, in every direction together (an ellipse): as fast
 /// as curvature allows, then a sweep backwards for braking and one forwards for driving (Subosits and Gerdes, 2015).
 pub fn speed_profile(line: &Raceline, params: &SpeedParams) -> Raceline {
+    fastest(line, params, |_| params.top)
+}
+
+/// The same for a line that was made for another car: nowhere faster than the line's own speeds either.
+pub fn slowed_to(line: &Raceline, params: &SpeedParams) -> Raceline {
+    fastest(line, params, |p| p.speed.min(params.top))
+}
+
+fn fastest(line: &Raceline, params: &SpeedParams, most: impl Fn(&RacelinePoint) -> f64) -> Raceline {
     let mut points: Vec<RacelinePoint> = line.points().to_vec();
     let n = points.len();
     let gaps: Vec<f64> = (0..n)
@@ -45,9 +54,7 @@ pub fn speed_profile(line: &Raceline, params: &SpeedParams) -> Raceline {
         })
         .collect();
     for p in &mut points {
-        p.speed = (params.lateral / p.curvature.abs().max(1e-6))
-            .sqrt()
-            .min(params.top);
+        p.speed = (params.lateral / p.curvature.abs().max(1e-6)).sqrt().min(most(p));
     }
     let left = |p: &RacelinePoint| {
         let lateral = p.speed * p.speed * p.curvature / params.lateral;
@@ -116,6 +123,30 @@ mod tests {
             let share = along / if along > 0.0 { params.drive } else { params.brake };
             assert!(lateral.abs() < 1.0 + 1e-9 && share.abs() < 1.0 + 1e-9);
         }
+    }
+
+    #[test]
+    fn a_line_for_a_better_car_is_slowed_and_one_for_a_slower_car_is_kept() {
+        let params = SpeedParams::default();
+        let own = speed_profile(&stadium(), &params);
+        let better = SpeedParams {
+            lateral: 12.0,
+            drive: 9.0,
+            brake: 11.0,
+            top: 12.0,
+        };
+        let slowed = slowed_to(&speed_profile(&stadium(), &better), &params);
+        for (a, b) in slowed.points().iter().zip(own.points()) {
+            assert!((a.speed - b.speed).abs() < 1e-9, "{a:?} {b:?}");
+        }
+        let careful = SpeedParams {
+            lateral: 2.0,
+            drive: 2.0,
+            brake: 2.0,
+            top: 3.0,
+        };
+        let line = speed_profile(&stadium(), &careful);
+        assert_eq!(slowed_to(&line, &params).points(), line.points());
     }
 
     #[test]

@@ -19,6 +19,7 @@ use protocol::Topic;
 use zenoh::Wait;
 use zenoh::query::Query;
 
+pub use self::answers::{Answered, Print};
 pub use self::clerk::{Clerk, Desk, SEARCH_PATIENCE};
 pub use self::file::{FileError, StateFile};
 
@@ -60,8 +61,7 @@ fn serve(clerk: &mut Clerk, inquiry: &Inquiry) {
     let Inquiry { topic, query } = inquiry;
     let payload = query.payload().map(|payload| payload.to_bytes());
     // One command is for one car: a wildcard would switch the whole field.
-    let wild = query.key_expr().is_wild() && !matches!(topic, Topic::Map | Topic::Info);
-    let answer = if wild {
+    let answer = if query.key_expr().is_wild() {
         Err(clerk.unreadable(*topic, "a command needs one car's key, without wildcards".into()))
     } else {
         clerk.answer(*topic, payload.as_deref())

@@ -6,10 +6,11 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use protocol::{Answer, ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
+use protocol::{ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
 use serde::{Deserialize, Serialize};
 use synpf::{Parameters, Stamp};
 
+use crate::desk::Answered;
 use crate::sets;
 use crate::wire;
 
@@ -36,7 +37,7 @@ pub struct Memory {
     /// The last answers to commands about sets that did something, the newest last: a command that comes again after a
     /// restart is answered again, and not done again.
     #[serde(default)]
-    pub answers: VecDeque<Answer>,
+    pub answers: VecDeque<Answered>,
 }
 
 /// The set in force.
@@ -142,11 +143,11 @@ impl Keeper {
     }
 
     /// Keeps an answer over a restart.
-    pub fn remember(&mut self, answer: Answer) {
+    pub fn remember(&mut self, given: Answered) {
         if self.memory.answers.len() >= MOST_ANSWERS {
             self.memory.answers.pop_front();
         }
-        self.memory.answers.push_back(answer);
+        self.memory.answers.push_back(given);
     }
 
     /// The set in force.

@@ -1,6 +1,7 @@
 //! The on-car node: SynPF on recorded, simulated or live sensors, published over zenoh.
 //!
 //! The library holds the parts, the binary the commands. See [`evaluate`] for a filter over a recorded log.
+pub mod archive;
 pub mod bag;
 pub mod clock;
 pub mod counters;
@@ -11,6 +12,7 @@ pub mod frames;
 pub mod health;
 pub mod keeper;
 pub mod laps;
+pub mod library;
 pub mod link;
 pub mod load;
 pub mod node;

@@ -1,7 +1,8 @@
 //! The network: the only file, with its publisher and its desk, that names zenoh.
 //!
 //! The car dials the pit wall as a peer and listens to nobody. It never blocks: what a slow link cannot take is
-//! dropped, and the streams that must be whole are recovered from caches on the car.
+//! dropped, and of the streams that must be whole the pit wall asks for what it lacks (`archive.rs`). zenoh-ext's recovery
+//! is not used: it answers from zenoh's receiving thread with blocking replies of any length, which stops a slow link.
 
 use std::time::Duration;
 
@@ -10,14 +11,6 @@ use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
-use zenoh_ext::{
-    AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig, RepliesConfig,
-};
-
-/// How long the caches reach back [s]: a lap out of radio contact.
-const CACHE: f64 = 30.0;
-/// Highest rate of a recorded stream [Hz].
-const RECORDED_RATE: f64 = 100.0;
 
 /// Why there is no link.
 #[derive(Debug, thiserror::Error)]
@@ -83,6 +76,11 @@ pub fn open(connect: &[String]) -> Result<Session, LinkError> {
         ("transport/link/tx/batch_size", BATCH.to_string()),
         ("transport/link/tx/queue/size/data", "4".to_owned()),
         ("transport/link/tx/queue/size/data_low", "16".to_owned()),
+        // A map takes many pieces, each of which waits for the one before; it goes when there is nothing else to send.
+        (
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+            "3000000".to_owned(),
+        ),
     ];
     let mut config = Config::default();
     for (key, value) in settings {
@@ -127,59 +125,27 @@ pub fn declare_alive(session: &Session, car: &CarName) -> Result<LivelinessToken
         })
 }
 
-/// A way out for one topic.
-#[derive(Debug)]
-pub enum Outlet {
-    /// Newest wins: what the link cannot take is gone.
-    Live(Publisher<'static>),
-    /// Cached on the car, so that a gap can be filled later.
-    Recovered(AdvancedPublisher<'static>),
-}
-
-impl Outlet {
-    /// Declares the publisher of a topic.
-    pub fn declare(session: &Session, car: &CarName, topic: Topic) -> Result<Self, LinkError> {
-        let key = Key::new(car.clone(), topic).to_string();
-        let failed = |error: zenoh::Error| LinkError::Declare {
-            key: key.clone(),
+/// A way out for one topic: what the link cannot take is dropped, never waited for.
+pub fn declare_publisher(
+    session: &Session,
+    car: &CarName,
+    topic: Topic,
+) -> Result<Publisher<'static>, LinkError> {
+    let key = Key::new(car.clone(), topic).to_string();
+    let priority = match topic {
+        Topic::Pose | Topic::Event => Priority::RealTime,
+        Topic::Health => Priority::InteractiveHigh,
+        Topic::Cloud | Topic::Scan => Priority::DataLow,
+        topic if topic.recorded() => Priority::DataLow,
+        _ => Priority::Data,
+    };
+    session
+        .declare_publisher(key.clone())
+        .congestion_control(CongestionControl::Drop)
+        .priority(priority)
+        .wait()
+        .map_err(|error| LinkError::Declare {
+            key,
             reason: error.to_string(),
-        };
-        let priority = match topic {
-            Topic::Pose | Topic::Event => Priority::RealTime,
-            Topic::Health => Priority::InteractiveHigh,
-            Topic::Cloud | Topic::Scan => Priority::DataLow,
-            topic if topic.recorded() => Priority::DataLow,
-            _ => Priority::Data,
-        };
-        let builder = session
-            .declare_publisher(key.clone())
-            .congestion_control(CongestionControl::Drop)
-            .priority(priority);
-        if !topic.recovered() {
-            return builder.wait().map(Self::Live).map_err(failed);
-        }
-        // What fills a gap comes ahead of what can wait, as the message would have: else, on a link that is never idle, it
-        // would never come.
-        let replies = RepliesConfig::default()
-            .congestion_control(CongestionControl::Drop)
-            .priority(priority);
-        let cache = CacheConfig::default()
-            .max_samples((CACHE * RECORDED_RATE) as usize)
-            .replies_config(replies);
-        builder
-            .cache(cache)
-            .sample_miss_detection(MissDetectionConfig::default().heartbeat(Duration::from_millis(500)))
-            .publisher_detection()
-            .wait()
-            .map(Self::Recovered)
-            .map_err(failed)
-    }
-
-    /// Sends.
-    pub fn put(&self, bytes: Vec<u8>) -> Result<(), zenoh::Error> {
-        match self {
-            Self::Live(publisher) => publisher.put(bytes).wait(),
-            Self::Recovered(publisher) => publisher.put(bytes).wait(),
-        }
-    }
+        })
 }

@@ -24,11 +24,13 @@ use zenoh::query::{Query, Queryable};
 use zenoh::sample::Sample;
 use zenoh::{Session, Wait};
 
+use crate::archive::Archive;
 use crate::clock::{SensorClock, wall_now};
 use crate::desk::{self, Desk, FileError, Inquiry, StateFile};
 use crate::filter::{self, DEFAULT_RATES, Filter, Shared};
 use crate::health::{Monitor, Thresholds};
 use crate::keeper::{Keeper, Memory};
+use crate::library::Library;
 use crate::link::{self, LinkError};
 use crate::load;
 use crate::publisher::Publisher;
@@ -153,6 +155,7 @@ pub struct Node {
     source: JoinHandle<()>,
     filter: JoinHandle<()>,
     desk: JoinHandle<()>,
+    library: JoinHandle<()>,
     load: JoinHandle<()>,
     shadow: JoinHandle<()>,
     publisher: JoinHandle<()>,
@@ -219,13 +222,22 @@ impl Node {
         let clock = source.clock(rate);
         let (map_message, info) = describe(&map, source.as_ref(), started)?;
 
-        let publisher = Publisher::new(&session, &car, session_number, clock, Arc::clone(&shared))?;
+        let archive = Arc::<Mutex<Archive>>::default();
+        let publisher = Publisher::new(
+            &session,
+            &car,
+            session_number,
+            clock,
+            Arc::clone(&shared),
+            Arc::clone(&archive),
+        )?;
         let (stop_publisher, publisher_stops) = bounded(0);
         let (stop_source, source_stops) = bounded(0);
         let (stop_desk, desk_stops) = bounded(0);
         let (feed, fed) = bounded(source::QUEUE);
         let (orders, ordered) = bounded(QUEUE);
         let (inquiries, inquired) = bounded(QUEUE);
+        let (look_ups, looked_up) = bounded(QUEUE);
         let (wishes, wished) = bounded(QUEUE);
         let (tap, tapped) = shadow::tap();
         let keeper = Keeper::new(memory, set.name, set.parameters, started);
@@ -275,14 +287,20 @@ impl Node {
                 session_number,
                 track_map: map.map,
                 search_patience: desk::SEARCH_PATIENCE,
-                map: map_message,
-                info,
             },
             inquired,
             desk_stops.clone(),
         )?;
+        let library = Library {
+            map: map_message,
+            info,
+            archive,
+            shared: Arc::clone(&shared),
+            session_number,
+        };
+        let library = library.start(looked_up, desk_stops.clone())?;
         let load = load::start(Arc::clone(&shared), desk_stops)?;
-        let queryables = declare_queryables(&session, &car, session_number, &inquiries, &shared)?;
+        let queryables = declare_queryables(&session, &car, session_number, &inquiries, &look_ups, &shared)?;
         let reports = declare_reports(&session, &car, &shared, clock)?;
         let alive = link::declare_alive(&session, &car)?;
         // The sensors last: from the first scan on, everybody can watch.
@@ -304,6 +322,7 @@ impl Node {
             source,
             filter,
             desk,
+            library,
             load,
             shadow,
             publisher,
@@ -339,6 +358,7 @@ impl Node {
         );
         drop(self.stop_desk);
         join(self.desk);
+        join(self.library);
         // The desk held the only way to give orders.
         join(self.filter);
         join(self.load);
@@ -415,12 +435,14 @@ fn begin_at(localizer: &mut Localizer, begin: Begin, start: Option<Pose>) -> Res
     Ok(true)
 }
 
-/// Declares every question and command. Answers but the clock's come from the desk: zenoh's threads never wait.
+/// Declares every question and command. Answers but the clock's come from the desk and the library: zenoh's threads never
+/// wait.
 fn declare_queryables(
     session: &Session,
     car: &CarName,
     session_number: u64,
     inquiries: &Sender<Inquiry>,
+    look_ups: &Sender<Inquiry>,
     shared: &Arc<Shared>,
 ) -> Result<Vec<Queryable<()>>, LinkError> {
     let declare = |topic: Topic, callback: Box<dyn Fn(Query) + Send + Sync>| {
@@ -441,20 +463,24 @@ fn declare_queryables(
     for topic in [
         Topic::Map,
         Topic::Info,
+        Topic::Missing,
         Topic::CmdParams,
         Topic::CmdPose,
         Topic::CmdRelocalize,
         Topic::CmdRates,
         Topic::CmdAuto,
     ] {
-        let inquiries = inquiries.clone();
+        let inquiries = match topic {
+            Topic::Map | Topic::Info | Topic::Missing => look_ups.clone(),
+            _ => inquiries.clone(),
+        };
         queryables.push(declare(
             topic,
             Box::new(move |query| match inquiries.try_send(Inquiry { topic, query }) {
                 Ok(()) | Err(TrySendError::Disconnected(_)) => {}
                 Err(TrySendError::Full(inquiry)) => {
                     // Dropping the query ends it without an answer: the asker may try again.
-                    tracing::warn!(%topic, "too many commands at once");
+                    tracing::warn!(%topic, "too many questions at once");
                     drop(inquiry);
                 }
             }),

@@ -1,18 +1,19 @@
 //! The telemetry thread: takes what the others have left, and sends it. A slow network slows down nobody else.
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use crossbeam_channel::{Receiver, TryRecvError};
 use protocol::{CarName, Message, Stamps, Topic, encode};
 use synpf::Stamp;
-use zenoh::Session;
+use zenoh::{Session, Wait};
 
+use crate::archive::Archive;
 use crate::clock::{SensorClock, wall_now};
 use crate::filter::Shared;
-use crate::link::{LinkError, Outlet};
+use crate::link::{self, LinkError};
 use crate::outbox::Record;
 use crate::wire;
 
@@ -38,7 +39,7 @@ const TICK: Duration = Duration::from_millis(50);
 
 /// One topic's way out, and how many messages have taken it.
 struct Stream {
-    outlet: Outlet,
+    outlet: zenoh::pubsub::Publisher<'static>,
     sequence: u64,
 }
 
@@ -48,6 +49,7 @@ pub struct Publisher {
     session_number: u64,
     clock: SensorClock,
     shared: Arc<Shared>,
+    archive: Arc<Mutex<Archive>>,
     failed: HashMap<Topic, u64>,
 }
 
@@ -59,11 +61,12 @@ impl Publisher {
         session_number: u64,
         clock: SensorClock,
         shared: Arc<Shared>,
+        archive: Arc<Mutex<Archive>>,
     ) -> Result<Self, LinkError> {
         let streams = TOPICS
             .into_iter()
             .map(|topic| {
-                let outlet = Outlet::declare(session, car, topic)?;
+                let outlet = link::declare_publisher(session, car, topic)?;
                 Ok((topic, Stream { outlet, sequence: 0 }))
             })
             .collect::<Result<_, LinkError>>()?;
@@ -72,6 +75,7 @@ impl Publisher {
             session_number,
             clock,
             shared,
+            archive,
             failed: HashMap::new(),
         })
     }
@@ -165,6 +169,7 @@ impl Publisher {
         }
     }
 
+    /// Sends a message. One of a stream that must be whole is kept, too, and while the link is too slow for it, only kept.
     fn send<M: Message>(&mut self, topic: Topic, sensor: Stamp, message: &M) {
         let Some(stream) = self.streams.get_mut(&topic) else {
             return;
@@ -179,7 +184,19 @@ impl Publisher {
             .map_err(|error| error.to_string())
             .and_then(|bytes| {
                 stream.sequence += 1;
-                stream.outlet.put(bytes).map_err(|error| error.to_string())
+                if topic.recovered() {
+                    let mut archive = self.archive.lock().unwrap_or_else(PoisonError::into_inner);
+                    archive.keep(topic, stream.sequence, bytes.clone());
+                    let throttle = self
+                        .shared
+                        .throttle
+                        .lock()
+                        .unwrap_or_else(PoisonError::into_inner);
+                    if topic.recorded() && throttle.parked() {
+                        return Ok(());
+                    }
+                }
+                stream.outlet.put(bytes).wait().map_err(|error| error.to_string())
             });
         if let Err(error) = sent {
             let failed = self.failed.entry(topic).or_default();

@@ -3,8 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use protocol::ValueChange;
 use serde_json::Value;
 use synpf::{ParameterFault, Parameters};
+
+use crate::wire;
 
 /// A set as it was found.
 #[derive(Debug, Clone, PartialEq)]
@@ -71,6 +74,20 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
         parameters,
         unknown_keys,
     })
+}
+
+/// The values in which two sets differ.
+pub fn changes(before: &Parameters, after: &Parameters) -> Vec<ValueChange> {
+    let was = values(before);
+    values(after)
+        .into_iter()
+        .filter(|(key, value)| was.get(key) != Some(value))
+        .filter_map(|(key, value)| {
+            let before = wire::value(was.get(&key)?)?;
+            let after = wire::value(&value)?;
+            Some(ValueChange { key, before, after })
+        })
+        .collect()
 }
 
 /// A set as flat keys and values.

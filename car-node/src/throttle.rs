@@ -10,9 +10,8 @@ use synpf::Stamp;
 const SLOW: f64 = 0.25;
 /// ...once that has lasted [s].
 const SLOW_FOR: f64 = 2.0;
-/// Where sending less has not helped for so long, the full-rate streams for the recorder end, too [s]: over a link that
-/// cannot take them, they only keep what is live from coming through. They stay while nothing arrives at all: an outage is
-/// made good from the car's caches.
+/// Where sending less has not helped for so long, the full-rate streams for the recorder stay on the car, too [s]: over a
+/// link that cannot take them, they only keep what is live from coming through. The pit wall asks for them as it can.
 const STILL_SLOW_FOR: f64 = 3.0;
 /// Poses that arrive sooner than this mean that the link has recovered [s]...
 const FAST: f64 = 0.1;
@@ -120,8 +119,13 @@ impl Throttle {
             cloud: wanted.cloud.min(most.cloud),
             scan: wanted.scan.min(most.scan),
             health: wanted.health.min(most.health),
-            recorded: wanted.recorded && most.recorded,
+            recorded: wanted.recorded,
         })
+    }
+
+    /// True while the full-rate streams are kept and not sent, until somebody asks for them.
+    pub fn parked(&self) -> bool {
+        self.lowered.is_some_and(|most| !most.recorded)
     }
 }
 
@@ -158,8 +162,8 @@ mod tests {
         );
         let lowered = throttle.rates(DEFAULT_RATES);
         assert_eq!(
-            (lowered.pose, lowered.cloud, lowered.recorded),
-            (20.0, 2.0, false)
+            (lowered.pose, lowered.cloud, lowered.recorded, throttle.parked()),
+            (20.0, 2.0, true, true)
         );
         // What was asked to be less stays less.
         let quiet = Rates {
@@ -170,6 +174,7 @@ mod tests {
         assert_eq!(report(&mut throttle, 20, 4, &[0.15]), [], "neither slow nor fast");
         assert_eq!(report(&mut throttle, 24, 12, &[0.02]), [Change::Restored]);
         assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
+        assert!(!throttle.parked());
     }
 
     #[test]

@@ -10,9 +10,9 @@ use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::source::Race;
 use common::router;
 use protocol::{
-    Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message, Outcome,
-    ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction, Reply, Shadow, Stamps, State, Topic, Value,
-    decode, encode,
+    Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message,
+    MissingReply, MissingRequest, Outcome, ParameterSet, Params, ParamsAction, Pose, Rates, RatesAction,
+    Reply, Shadow, Stamps, State, Topic, Value, Wanted, decode, encode,
 };
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;
@@ -260,14 +260,35 @@ fn a_set_put_on_the_car_survives_a_restart() {
     };
     let faulty = wall.command(&car, 1, None, put("mine", Value::Text("many".into())));
     assert!(matches!(faulty.outcome, Outcome::Refused { .. }), "{faulty:?}");
-    let answer = wall.command(&car, 2, None, put("mine", Value::Int(1500)));
+    let events = wall.subscribe(&car, Topic::Event);
+    let answer = wall.command(&car, 2, None, put("mine", Value::Int(1400)));
     assert!(matches!(answer.outcome, Outcome::Done { .. }), "{answer:?}");
+    // What was before, and what is now: against the set in force, and then against what it was itself.
+    let stored = |expected: &str| {
+        let (_, event) = next::<Event>(&events, |event| matches!(event.kind, EventKind::SetStored { .. }));
+        assert_eq!(event.kind.to_string(), expected);
+    };
+    stored("set mine stored, as hq but for max_particles 1500 -> 1400");
+    wall.command(&car, 20, None, put("mine", Value::Int(1300)));
+    stored("set mine stored in place of what it was: max_particles 1400 -> 1300");
+    let answer = wall.command(&car, 21, None, put("mine", Value::Int(1500)));
+    // The same command again is answered again; another one under its id is refused.
+    assert_eq!(
+        wall.command(&car, 21, None, put("mine", Value::Int(1500))),
+        answer
+    );
+    let refused = |answer: Answer| matches!(&answer.outcome, Outcome::Refused { faults } if faults[0].contains("another command"));
+    assert!(refused(wall.command(&car, 21, None, select("lq", None))));
     node.shutdown("test over");
 
     let (node, car) = start_and_wait("charlie", &wall, state);
     let list = wall.command(&car, 3, None, Action::Params(ParamsAction::List));
     assert_eq!(list.set.name, "mine", "what was in force is in force again");
     assert!(revision(&list) > revision(&answer));
+    assert!(
+        refused(wall.command(&car, 21, None, select("lq", None))),
+        "after a restart, too"
+    );
     let Outcome::Done {
         reply: Reply::Sets(sets),
         ..
@@ -472,6 +493,51 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
         assert!(last.is_none_or(|last| pose.update == last + 1));
         last = Some(pose.update);
     }
+}
+
+#[test]
+fn what_did_not_arrive_can_be_asked_for() {
+    let wall = Wall::open();
+    let (node, car) = start_and_wait("hotel", &wall, |_| ());
+    let ask = |session: u64, ranges: Vec<[u64; 2]>| {
+        let request = MissingRequest {
+            session,
+            streams: vec![Wanted {
+                topic: Topic::Event,
+                ranges,
+            }],
+            budget: 1000,
+        };
+        let bytes = encode(&request, Stamps::default()).expect("encodes");
+        let key = Key::new(car.clone(), Topic::Missing).to_string();
+        let reply = wall
+            .ask(&key, bytes)
+            .expect("an answer")
+            .expect("a readable question");
+        decode::<MissingReply>(&reply).expect("a MissingReply")
+    };
+    let (header, reply) = ask(0, vec![[1, 1]]);
+    assert_eq!(reply.messages, [], "of another session");
+    // Every stream that must be whole is kept, as soon as it has begun.
+    let begun = Instant::now();
+    for topic in Topic::all().filter(|topic| topic.recovered()) {
+        while !ask(0, Vec::new())
+            .1
+            .streams
+            .iter()
+            .any(|kept| kept.topic == topic)
+        {
+            assert!(begun.elapsed() < DEADLINE, "{topic} is not kept");
+        }
+    }
+    let (_, reply) = ask(header.session, vec![[1, 1]]);
+    let [first] = &reply.messages[..] else {
+        panic!("{reply:?}");
+    };
+    let (header, event) = decode::<Event>(&first.bytes).expect("as it was sent");
+    assert_eq!(header.sequence, 1);
+    assert!(matches!(event.kind, EventKind::Started { .. }), "{event:?}");
+    node.shutdown("test over");
 }
 
 #[test]

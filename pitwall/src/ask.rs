@@ -11,6 +11,7 @@ use protocol::{
 };
 use serde::Serialize;
 use tokio::sync::mpsc;
+use zenoh::qos::Priority;
 use zenoh::query::ConsolidationMode;
 
 use crate::event::Happening;
@@ -18,6 +19,8 @@ use crate::link::{ASK_CONGESTION, ASK_PRIORITY, Link, unix_now};
 
 /// How long a car may take to answer: as long as a link may be silent before it counts as cut.
 pub const PATIENCE: Duration = Duration::from_secs(4);
+/// How long a map may take, which is long and goes when there is nothing else to send.
+const MAP_PATIENCE: Duration = Duration::from_secs(20);
 /// A command that is not answered for so long is sent again: the radio may have lost it, or its answer.
 const REPEAT: Duration = Duration::from_millis(500);
 /// A car that has not been seen for so long since it was asked is not there. Asked once is not enough: over a slow link,
@@ -165,8 +168,15 @@ impl Link {
         let mut presence = Box::pin(self.alive_after(Duration::ZERO, car));
         loop {
             let left = patience.saturating_sub(begun.elapsed());
-            self.pose(car, command.action.topic(), bytes.clone(), left, &answers)
-                .await;
+            self.pose(
+                car,
+                command.action.topic(),
+                bytes.clone(),
+                left,
+                ASK_PRIORITY,
+                &answers,
+            )
+            .await;
             let again = tokio::time::sleep(REPEAT.min(left));
             tokio::pin!(again);
             loop {
@@ -202,6 +212,7 @@ impl Link {
         topic: Topic,
         question: Vec<u8>,
         patience: Duration,
+        priority: Priority,
         answers: &mpsc::UnboundedSender<Vec<u8>>,
     ) {
         let key = Key::new(car.clone(), topic).to_string();
@@ -213,7 +224,7 @@ impl Link {
             .timeout(patience)
             .consolidation(ConsolidationMode::None)
             .congestion_control(ASK_CONGESTION)
-            .priority(ASK_PRIORITY)
+            .priority(priority)
             .callback(move |reply| match reply.into_result() {
                 // Nobody waits any more after the first.
                 Ok(sample) => drop(answers.send(sample.payload().to_bytes().into_owned())),
@@ -252,7 +263,7 @@ impl Link {
     /// Fetches the car's map and hands it on as an event. None when the car does not answer.
     pub async fn fetch_map(&self, car: &CarName) -> Option<()> {
         let bytes = self
-            .ask_bytes(car, Topic::Map, Vec::new(), Duration::from_secs(5))
+            .ask_bytes(car, Topic::Map, Vec::new(), MAP_PATIENCE, Priority::Background)
             .await?;
         match decode::<MapReply>(&bytes) {
             Ok((_, map)) => self.hand_on(
@@ -320,7 +331,7 @@ impl Link {
         question: Vec<u8>,
         patience: Duration,
     ) -> Result<Option<M>, String> {
-        match self.ask_bytes(car, topic, question, patience).await {
+        match self.ask_bytes(car, topic, question, patience, ASK_PRIORITY).await {
             Some(bytes) => decode::<M>(&bytes)
                 .map(|(_, message)| Some(message))
                 .map_err(|e| e.to_string()),
@@ -334,9 +345,11 @@ impl Link {
         topic: Topic,
         question: Vec<u8>,
         patience: Duration,
+        priority: Priority,
     ) -> Option<Vec<u8>> {
         let (answers, mut answered) = mpsc::unbounded_channel();
-        self.pose(car, topic, question, patience, &answers).await;
+        self.pose(car, topic, question, patience, priority, &answers)
+            .await;
         // With the last sender, which the question holds until it is answered or given up, the wait ends.
         drop(answers);
         answered.recv().await

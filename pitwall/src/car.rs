@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use crate::history::{History, Moment, Place, Strip};
 use crate::laps::{Lap, LapBook, Passed};
-use crate::stream::{Stream, StreamView};
+use crate::stream::{Stream, StreamView, Taken};
 
 /// A car as the pit wall sees it.
 #[derive(Debug, Clone)]
@@ -98,11 +98,17 @@ impl Car {
         }
     }
 
-    /// Takes in a message that arrived at `at` [unix ns]. True when it was the newest of its stream.
+    /// Takes in a message that arrived at `at` [unix ns]. True when it was news: the newest of its stream, or an event that
+    /// has not come before.
     pub(crate) fn take(&mut self, topic: Topic, header: &Header, telemetry: &Telemetry, at: i64) -> bool {
         self.last_heard = self.last_heard.max(at);
-        let newest = self.streams.entry(topic).or_default().arrive(header, at);
-        if !newest {
+        let news = match self.streams.entry(topic).or_default().arrive(header, at) {
+            Taken::Newest => true,
+            // Better told late than never.
+            Taken::Older => topic == Topic::Event,
+            Taken::Repeated => false,
+        };
+        if !news {
             return false;
         }
         match telemetry {

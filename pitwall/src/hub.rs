@@ -1,5 +1,6 @@
 //! The running pit wall: a link whose events keep a fleet up to date and, when asked, fill a recording.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -19,6 +20,9 @@ pub struct Hub {
     link: Link,
     board: Arc<Board>,
     housekeeping: Mutex<Option<JoinHandle<()>>>,
+    /// Cars that are being asked for their map and what runs on them: over a slow link the answer takes longer than it
+    /// takes until the next look.
+    fetching: Mutex<BTreeSet<CarName>>,
 }
 
 impl Hub {
@@ -28,8 +32,10 @@ impl Hub {
     const REPORT_LINKS: Duration = Duration::from_secs(1);
     /// How often clocks are compared.
     const COMPARE_CLOCKS: Duration = Duration::from_secs(2);
-    /// How long gaps may take to fill when a recording is about to end.
+    /// When a recording is about to end, gaps are waited for while one is filled at least this often...
     const FILL_GAPS: Duration = Duration::from_millis(1500);
+    /// ...but no longer than this in all.
+    const FILL_GAPS_AT_MOST: Duration = Duration::from_secs(15);
 
     /// Opens the link. Needs a multi-thread tokio runtime.
     pub async fn open(role: &Role) -> Result<Arc<Self>, LinkError> {
@@ -40,6 +46,7 @@ impl Hub {
             link,
             board,
             housekeeping: Mutex::default(),
+            fetching: Mutex::default(),
         });
         let task = tokio::spawn(keep_house(Arc::downgrade(&hub)));
         *hub.housekeeping.lock().unwrap_or_else(PoisonError::into_inner) = Some(task);
@@ -102,12 +109,14 @@ impl Hub {
 
     /// Ends the recording and says what is in it. None when there was none.
     pub async fn stop_recording(&self) -> Option<Result<Summary, RecordingError>> {
-        let deadline = Instant::now() + Self::FILL_GAPS;
-        while Instant::now() < deadline
-            && self
-                .recording()
-                .is_some_and(|status| status.summary.missing() > 0)
-        {
+        let begun = Instant::now();
+        let (mut filled, mut fewest) = (begun, u64::MAX);
+        while filled.elapsed() < Self::FILL_GAPS && begun.elapsed() < Self::FILL_GAPS_AT_MOST {
+            match self.recording().map_or(0, |status| status.summary.missing()) {
+                0 => break,
+                missing if missing < fewest => (filled, fewest) = (Instant::now(), missing),
+                _ => {}
+            }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
         let recorder = self.board.recorder().take()?;
@@ -193,12 +202,17 @@ async fn keep_house(hub: std::sync::Weak<Hub>) {
                 let hub = hub.clone();
                 tokio::spawn(async move {
                     hub.link.compare_clocks(&car).await;
+                    let fetching = || hub.fetching.lock().unwrap_or_else(PoisonError::into_inner);
+                    if !(info || map) || !fetching().insert(car.clone()) {
+                        return;
+                    }
                     if info {
                         hub.link.fetch_info(&car).await;
                     }
                     if map {
                         hub.link.fetch_map(&car).await;
                     }
+                    fetching().remove(&car);
                 });
             }
         }

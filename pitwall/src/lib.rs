@@ -14,6 +14,7 @@ extern crate self as pitwall;
 mod ask;
 mod board;
 mod car;
+mod catch_up;
 mod cli;
 mod commands;
 mod event;

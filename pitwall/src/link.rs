@@ -3,20 +3,23 @@
 //! The pit wall opens a router in its own process and the cars dial it, so that no daemon is needed. A second
 //! program on the same laptop joins the first one's router as a client. zenoh's threads only note when a message
 //! arrived: one that is slow to take in is one that loses messages. A thread of our own decodes each once and hands
-//! it on as a [`FleetEvent`].
+//! it on as a [`FleetEvent`]; it also knows what has not come (`catch_up.rs`), and has a task ask the cars for it.
 
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use crossbeam_channel::{Receiver, Sender};
-use protocol::{CarName, Key, Telemetry, Topic};
-use zenoh::handlers::Callback;
+use crossbeam_channel::{Receiver, Sender, select};
+use protocol::{CarName, Header, Key, MissingReply, Resent, Stamps, Telemetry, Topic, decode, encode};
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::ConsolidationMode;
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Config, Session};
-use zenoh_ext::{AdvancedSubscriber, AdvancedSubscriberBuilderExt, HistoryConfig, RecoveryConfig};
 
+use crate::catch_up::{CatchUp, Place, Question};
 use crate::event::{FleetEvent, Happening, Lane};
 
 /// Where a pit wall listens for cars unless told otherwise.
@@ -138,7 +141,14 @@ pub struct Link {
     sink: Sink,
     arrivals: Sender<Arrival>,
     _live: Vec<Box<dyn Send + Sync>>,
-    recorded: Mutex<Vec<AdvancedSubscriber<()>>>,
+    recorded: Mutex<Vec<Subscriber<()>>>,
+    asking: JoinHandle<()>,
+}
+
+impl Drop for Link {
+    fn drop(&mut self) {
+        self.asking.abort();
+    }
 }
 
 /// Takes events in, in the link's own thread: what comes meanwhile queues.
@@ -153,26 +163,33 @@ impl Link {
             reason: e.to_string(),
         })?;
         let (arrivals, queue) = crossbeam_channel::bounded(QUEUE);
-        let out = sink.clone();
+        let (answers, answered) = crossbeam_channel::unbounded();
+        let (questions, asked) = mpsc::unbounded_channel();
+        let decoding = Decoding {
+            catch_up: CatchUp::default(),
+            sink: sink.clone(),
+            questions,
+        };
         std::thread::Builder::new()
             .name("decode".to_owned())
-            .spawn(move || hand_on_all(&queue, &out))
+            .spawn(move || decoding.run(&queue, &answered))
             .map_err(LinkError::Thread)?;
+        let asking = tokio::spawn(ask_all(session.clone(), asked, answers));
         let mut live: Vec<Box<dyn Send + Sync>> = Vec::new();
         for topic in Topic::all() {
             match topic {
-                Topic::Alive => live.push(Box::new(alive(&session, &sink).await?)),
-                // Newest wins: whatever comes, as it comes.
-                Topic::Pose | Topic::Cloud | Topic::Scan | Topic::Load | Topic::Params | Topic::Shadow => {
-                    live.push(Box::new(plain(&session, topic, &arrivals).await?));
-                }
-                // The display follows the plain subscriber: the other one holds back what comes after a gap until
-                // the gap is filled.
-                Topic::Health => {
-                    live.push(Box::new(plain(&session, topic, &arrivals).await?));
-                    live.push(Box::new(complete(&session, topic, &arrivals).await?));
-                }
-                Topic::Event => live.push(Box::new(complete(&session, topic, &arrivals).await?)),
+                Topic::Alive => live.push(Box::new(alive(&session, &sink, &arrivals).await?)),
+                // Newest wins: whatever comes, as it comes. Of health, what is missing follows.
+                Topic::Pose
+                | Topic::Cloud
+                | Topic::Scan
+                | Topic::Health
+                | Topic::Load
+                | Topic::Params
+                | Topic::Shadow => live.push(Box::new(listen(&session, topic, Lane::Live, &arrivals).await?)),
+                Topic::Event => live.push(Box::new(
+                    listen(&session, topic, Lane::Complete, &arrivals).await?,
+                )),
                 _ => {}
             }
         }
@@ -182,6 +199,7 @@ impl Link {
             arrivals,
             _live: live,
             recorded: Mutex::default(),
+            asking,
         })
     }
 
@@ -199,9 +217,10 @@ impl Link {
         let mut subscribers = Vec::new();
         if on {
             for topic in Topic::all().filter(|topic| topic.recorded()) {
-                subscribers.push(complete(&self.session, topic, &self.arrivals).await?);
+                subscribers.push(listen(&self.session, topic, Lane::Complete, &self.arrivals).await?);
             }
         }
+        self.arrivals.try_send(Arrival::WantRecorded(on)).ok();
         let before = std::mem::replace(
             &mut *self.recorded.lock().unwrap_or_else(PoisonError::into_inner),
             subscribers,
@@ -222,8 +241,13 @@ impl Link {
     }
 }
 
-async fn alive(session: &Session, sink: &Sink) -> Result<impl Send + Sync + use<>, LinkError> {
+async fn alive(
+    session: &Session,
+    sink: &Sink,
+    arrivals: &Sender<Arrival>,
+) -> Result<impl Send + Sync + use<>, LinkError> {
     let sink = sink.clone();
+    let arrivals = arrivals.clone();
     let key = Topic::Alive.of_all_cars();
     session
         .liveliness()
@@ -234,7 +258,11 @@ async fn alive(session: &Session, sink: &Sink) -> Result<impl Send + Sync + use<
                 return;
             };
             let happening = match sample.kind() {
-                SampleKind::Put => Happening::Appeared,
+                SampleKind::Put => {
+                    // Full of messages from it, it is known to be there anyway.
+                    arrivals.try_send(Arrival::Appeared(key.car.clone())).ok();
+                    Happening::Appeared
+                }
                 SampleKind::Delete => Happening::Vanished,
             };
             sink(FleetEvent {
@@ -247,74 +275,155 @@ async fn alive(session: &Session, sink: &Sink) -> Result<impl Send + Sync + use<
         .map_err(|e| LinkError::subscribe(&key, &e))
 }
 
-async fn plain(
+async fn listen(
     session: &Session,
     topic: Topic,
+    lane: Lane,
     arrivals: &Sender<Arrival>,
-) -> Result<impl Send + Sync + use<>, LinkError> {
+) -> Result<Subscriber<()>, LinkError> {
     let key = topic.of_all_cars();
+    let arrivals = arrivals.clone();
     session
         .declare_subscriber(&key)
-        .with(take_in(Lane::Live, arrivals))
+        .callback(move |sample: Sample| {
+            let at = unix_now();
+            if arrivals.try_send(Arrival::Sample { at, lane, sample }).is_err() {
+                tracing::warn!("messages come faster than they can be decoded; some are lost");
+            }
+        })
         .await
         .map_err(|e| LinkError::subscribe(&key, &e))
 }
 
-async fn complete(
-    session: &Session,
-    topic: Topic,
-    arrivals: &Sender<Arrival>,
-) -> Result<AdvancedSubscriber<()>, LinkError> {
-    let key = topic.of_all_cars();
-    // What a car sent before it found us comes too: all its events, and of the rest the last second or two.
-    let mut history = HistoryConfig::default().detect_late_publishers();
-    if topic != Topic::Event {
-        history = history.max_samples(HISTORY);
-    }
-    session
-        .declare_subscriber(&key)
-        .with(take_in(Lane::Complete, arrivals))
-        .advanced()
-        .history(history)
-        .recovery(RecoveryConfig::default().heartbeat())
-        .await
-        .map_err(|e| LinkError::subscribe(&key, &e))
-}
-
-/// Messages of a stream that are asked for when its sender is found.
-const HISTORY: usize = 100;
 /// Messages that may wait to be decoded: some ten seconds of twenty cars.
 const QUEUE: usize = 100_000;
+/// How often what is missing is looked at.
+const TICK: Duration = Duration::from_millis(50);
+/// How long a car may take to answer what is missing.
+const MISSING_PATIENCE: Duration = Duration::from_secs(3);
 
-/// A message, as it arrived.
-struct Arrival {
+/// What arrives, as it arrived.
+#[expect(clippy::large_enum_variant, reason = "nearly all of them are samples")]
+enum Arrival {
+    Sample { at: i64, lane: Lane, sample: Sample },
+    Appeared(CarName),
+    WantRecorded(bool),
+}
+
+/// What became of a question for what is missing.
+struct Answered {
+    at: i64,
+    car: CarName,
+    /// The car's session and its answer; None when it did not answer.
+    reply: Option<(u64, MissingReply)>,
+}
+
+/// A message of a known car and topic.
+struct Received {
     at: i64,
     lane: Lane,
-    sample: Sample,
+    key: Key,
+    bytes: Arc<[u8]>,
 }
 
-fn take_in(lane: Lane, arrivals: &Sender<Arrival>) -> Callback<Sample> {
-    let arrivals = arrivals.clone();
-    Callback::from(move |sample: Sample| {
-        let at = unix_now();
-        if arrivals.try_send(Arrival { at, lane, sample }).is_err() {
-            tracing::warn!("messages come faster than they can be decoded; some are lost");
-        }
-    })
+/// Decodes what arrives, and knows what has not.
+struct Decoding {
+    catch_up: CatchUp<Received>,
+    sink: Sink,
+    questions: mpsc::UnboundedSender<Question>,
 }
 
-/// Decodes what arrives and hands it on, until the link is closed.
-fn hand_on_all(arrivals: &Receiver<Arrival>, sink: &Sink) {
-    for Arrival { at, lane, sample } in arrivals {
-        if sample.kind() != SampleKind::Put {
-            continue;
+impl Decoding {
+    /// Until the link is closed.
+    fn run(mut self, arrivals: &Receiver<Arrival>, answers: &Receiver<Answered>) {
+        let mut looked = Instant::now();
+        loop {
+            select! {
+                recv(arrivals) -> arrival => match arrival {
+                    Ok(arrival) => self.take_in(arrival),
+                    Err(_) => return,
+                },
+                // Its end is the end of the arrivals, too.
+                recv(answers) -> answer => if let Ok(answer) = answer {
+                    self.take_answer(answer);
+                    self.ask(unix_now());
+                },
+                default(TICK) => {}
+            }
+            if looked.elapsed() >= TICK {
+                looked = Instant::now();
+                let now = unix_now();
+                for received in self.catch_up.overdue(now) {
+                    self.hand_on(received);
+                }
+                self.ask(now);
+            }
         }
-        // A key that is not ours cannot be told from a stranger's: no car to count it against.
-        let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-            tracing::debug!(key = %sample.key_expr(), "not a key of ours");
-            continue;
+    }
+
+    fn ask(&mut self, now: i64) {
+        for question in self.catch_up.due(now) {
+            // Nobody asks any more when the link is being closed.
+            self.questions.send(question).ok();
+        }
+    }
+
+    fn take_in(&mut self, arrival: Arrival) {
+        match arrival {
+            Arrival::Appeared(car) => self.catch_up.appeared(&car),
+            Arrival::WantRecorded(on) => self.catch_up.want_recorded(on),
+            Arrival::Sample { at, lane, sample } => {
+                if sample.kind() != SampleKind::Put {
+                    return;
+                }
+                // A key that is not ours cannot be told from a stranger's: no car to count it against.
+                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                    tracing::debug!(key = %sample.key_expr(), "not a key of ours");
+                    return;
+                };
+                let bytes = sample.payload().to_bytes().into();
+                self.take_message(Received { at, lane, key, bytes });
+            }
+        }
+    }
+
+    fn take_message(&mut self, received: Received) {
+        let header = Header::read(&received.bytes);
+        let (Ok(header), true) = (header, received.key.topic.recovered()) else {
+            return self.hand_on(received);
         };
-        let bytes: Arc<[u8]> = sample.payload().to_bytes().into();
+        let place = Place {
+            topic: received.key.topic,
+            session: header.session,
+            number: header.sequence,
+        };
+        let (car, at) = (received.key.car.clone(), received.at);
+        for received in self.catch_up.arrive(&car, place, received, at) {
+            self.hand_on(received);
+        }
+    }
+
+    fn take_answer(&mut self, Answered { at, car, reply }: Answered) {
+        let Some((session, MissingReply { streams, messages })) = reply else {
+            return self.catch_up.unanswered(&car, at);
+        };
+        let more = !messages.is_empty();
+        for Resent { topic, bytes } in messages {
+            self.take_message(Received {
+                at,
+                lane: Lane::Complete,
+                key: Key::new(car.clone(), topic),
+                bytes: bytes.into(),
+            });
+        }
+        for received in self.catch_up.answered(&car, session, &streams, more, at) {
+            self.hand_on(received);
+        }
+    }
+
+    /// Decodes a message and hands it on.
+    fn hand_on(&self, received: Received) {
+        let Received { at, lane, key, bytes } = received;
         let happening = match Telemetry::decode(key.topic, &bytes) {
             Some(Ok((header, telemetry))) => Happening::Message {
                 topic: key.topic,
@@ -327,13 +436,65 @@ fn hand_on_all(arrivals: &Receiver<Arrival>, sink: &Sink) {
                 topic: key.topic,
                 error: error.to_string(),
             },
-            None => continue,
+            None => return,
         };
-        sink(FleetEvent {
+        (self.sink)(FleetEvent {
             at,
             car: key.car,
             happening,
         });
+    }
+}
+
+/// Puts questions for what is missing, until nobody has any more.
+async fn ask_all(
+    session: Session,
+    mut questions: mpsc::UnboundedReceiver<Question>,
+    answers: Sender<Answered>,
+) {
+    while let Some(question) = questions.recv().await {
+        let (session, answers) = (session.clone(), answers.clone());
+        tokio::spawn(async move {
+            let car = question.car.clone();
+            let reply = ask_for_missing(&session, question).await;
+            let at = unix_now();
+            // The thread that asked is gone when the link is closed.
+            answers.send(Answered { at, car, reply }).ok();
+        });
+    }
+}
+
+/// Asks a car for what is missing. None without an answer in time.
+async fn ask_for_missing(session: &Session, question: Question) -> Option<(u64, MissingReply)> {
+    let key = Key::new(question.car, Topic::Missing).to_string();
+    let stamps = Stamps {
+        published: unix_now(),
+        ..Stamps::default()
+    };
+    // The answer comes with the question's priority: ahead of what can wait, behind what an operator waits for.
+    let priority = if question.urgent {
+        Priority::DataHigh
+    } else {
+        Priority::Data
+    };
+    let replies = session
+        .get(&key)
+        .payload(encode(&question.request, stamps).ok()?)
+        .timeout(MISSING_PATIENCE)
+        .consolidation(ConsolidationMode::None)
+        .congestion_control(ASK_CONGESTION)
+        .priority(priority)
+        .await
+        .inspect_err(|error| tracing::debug!(%key, %error, "the question could not be sent"))
+        .ok()?;
+    let reply = replies.recv_async().await.ok()?;
+    let bytes = reply.result().ok()?.payload().to_bytes();
+    match decode::<MissingReply>(&bytes) {
+        Ok((header, reply)) => Some((header.session, reply)),
+        Err(error) => {
+            tracing::debug!(%key, %error, "an answer that cannot be read");
+            None
+        }
     }
 }
 

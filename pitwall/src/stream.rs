@@ -21,6 +21,17 @@ pub struct Stream {
     transits: VecDeque<(i64, f64)>,
 }
 
+/// What a message was to its stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Taken {
+    /// Newer than all before it.
+    Newest,
+    /// It was missing until now.
+    Older,
+    /// It had come already.
+    Repeated,
+}
+
 /// [ns]
 const SECOND: i64 = 1_000_000_000;
 
@@ -28,11 +39,11 @@ impl Stream {
     /// Messages that a rate is taken over.
     const WINDOW: usize = 64;
 
-    /// Takes note of a message that arrived at `at` [unix ns]. True when it is newer than all before it.
-    pub fn arrive(&mut self, header: &Header, at: i64) -> bool {
+    /// Takes note of a message that arrived at `at` [unix ns].
+    pub fn arrive(&mut self, header: &Header, at: i64) -> Taken {
         let arrival = self.gaps.arrive(header.session, header.sequence);
         if arrival == Arrival::Repeated {
-            return false;
+            return Taken::Repeated;
         }
         let order = |h: &Header| (h.session, h.sequence);
         let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
@@ -52,7 +63,7 @@ impl Stream {
                 self.transits.pop_front();
             }
         }
-        newer
+        if newer { Taken::Newest } else { Taken::Older }
     }
 
     /// Takes note of bytes that could not be read; returns how many there were.
@@ -183,10 +194,11 @@ mod tests {
     #[test]
     fn an_older_message_fills_a_gap_but_is_not_newer() {
         let mut stream = Stream::default();
-        assert!(stream.arrive(&header(1), 0));
-        assert!(stream.arrive(&header(3), 1));
-        assert!(!stream.arrive(&header(2), 2));
-        assert!(!stream.arrive(&header(3), 3));
+        let taken = [1, 3, 2, 3].map(|number| stream.arrive(&header(number), 0));
+        assert_eq!(
+            taken,
+            [Taken::Newest, Taken::Newest, Taken::Older, Taken::Repeated]
+        );
         let view = stream.view(0, 0);
         assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
     }

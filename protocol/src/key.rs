@@ -109,11 +109,13 @@ pub enum Topic {
     Shadow,
     /// [`LinkReport`](crate::LinkReport), put by the pit wall.
     Link,
+    /// Question with a [`MissingRequest`](crate::MissingRequest): [`MissingReply`](crate::MissingReply).
+    Missing,
 }
 
 impl Topic {
     /// The key table.
-    const TABLE: [(Self, &'static str); 23] = [
+    const TABLE: [(Self, &'static str); 24] = [
         (Self::Alive, "alive"),
         (Self::Pose, "pose"),
         (Self::Cloud, "cloud"),
@@ -137,6 +139,7 @@ impl Topic {
         (Self::CmdAuto, "cmd/auto"),
         (Self::Shadow, "shadow"),
         (Self::Link, "link"),
+        (Self::Missing, "missing"),
     ];
 
     /// Every topic.
@@ -169,7 +172,7 @@ impl Topic {
         )
     }
 
-    /// True for topics whose gaps the receiver has filled from the sender's cache.
+    /// True for topics whose gaps the receiver has filled by the sender, which keeps them for a while.
     pub fn recovered(self) -> bool {
         self.recorded() || matches!(self, Self::Health | Self::Event)
     }

@@ -112,4 +112,8 @@ schemas! {
     Shadow = 17,
     /// [`LinkReport`](crate::LinkReport)
     LinkReport = 18,
+    /// [`MissingRequest`](crate::MissingRequest)
+    MissingRequest = 19,
+    /// [`MissingReply`](crate::MissingReply)
+    MissingReply = 20,
 }

@@ -62,7 +62,8 @@ impl Telemetry {
             | Topic::CmdRelocalize
             | Topic::CmdRates
             | Topic::CmdAuto
-            | Topic::Link => return None,
+            | Topic::Link
+            | Topic::Missing => return None,
         })
     }
 }

@@ -9,14 +9,13 @@ use std::time::Duration;
 use pitwall::unix_now;
 use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
-    Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Key, Latency, Load,
-    MapRaceline, MapReply, Message, Metrics, Outcome, ParameterSet, Params, ParamsAction, Pose, Pose2,
-    PoseKind, RecordedOdometry, RelocalizeAction, Reply, ScanView, SetRef, Stamps, State, Topic, TrackPoint,
-    Twist2, Value, decode, encode,
+    Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Kept, Key, Latency, Load,
+    MapRaceline, MapReply, Message, Metrics, MissingReply, MissingRequest, Outcome, ParameterSet, Params,
+    ParamsAction, Pose, Pose2, PoseKind, RecordedOdometry, RelocalizeAction, Reply, Resent, ScanView, SetRef,
+    Stamps, State, Topic, TrackPoint, Twist2, Value, decode, encode,
 };
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
-use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig, MissDetectionConfig};
 
 /// What a fake car does wrong.
 #[derive(Debug, Clone, Copy, Default)]
@@ -41,6 +40,8 @@ pub struct FakeCar {
 /// What it has sent, and the set in force.
 struct CarState {
     published: BTreeMap<Topic, u64>,
+    /// All messages of the streams that must be whole.
+    sent: BTreeMap<Topic, Vec<Vec<u8>>>,
     set: SetRef,
     who: String,
     session: u64,
@@ -79,6 +80,7 @@ impl FakeCar {
         let session = zenoh::open(config(endpoint)).await.expect("a session");
         let state = Arc::new(Mutex::new(CarState {
             published: BTreeMap::new(),
+            sent: BTreeMap::new(),
             set: SetRef {
                 name: "hq".into(),
                 revision: 1,
@@ -161,31 +163,12 @@ fn config(endpoint: &str) -> Config {
 struct Topics {
     session: Session,
     name: CarName,
-    complete: BTreeMap<Topic, AdvancedPublisher<'static>>,
     _alive: zenoh::liveliness::LivelinessToken,
 }
 
 impl Topics {
     async fn declare(session: &Session, name: &CarName) -> Self {
         let key = |topic| Key::new(name.clone(), topic).to_string();
-        let mut complete = BTreeMap::new();
-        for topic in [
-            Topic::Health,
-            Topic::Load,
-            Topic::Params,
-            Topic::Event,
-            Topic::RecordedPose,
-            Topic::RecordedOdometry,
-        ] {
-            let publisher = session
-                .declare_publisher(key(topic))
-                .cache(CacheConfig::default().max_samples(500))
-                .sample_miss_detection(MissDetectionConfig::default().heartbeat(Duration::from_millis(500)))
-                .publisher_detection()
-                .await
-                .expect("a publisher");
-            complete.insert(topic, publisher);
-        }
         let alive = session
             .liveliness()
             .declare_token(key(Topic::Alive))
@@ -194,7 +177,6 @@ impl Topics {
         Self {
             session: session.clone(),
             name: name.clone(),
-            complete,
             _alive: alive,
         }
     }
@@ -202,13 +184,12 @@ impl Topics {
     async fn put(&self, topic: Topic, message: &impl Message, state: &Mutex<CarState>) {
         let stamps = state.lock().expect("no panic").stamps(topic);
         let bytes = encode(message, stamps).expect("a good message");
-        let sent = if let Some(publisher) = self.complete.get(&topic) {
-            publisher.put(bytes).await
-        } else {
-            let key = Key::new(self.name.clone(), topic).to_string();
-            self.session.put(key, bytes).await
-        };
-        sent.expect("sent");
+        if topic.recovered() {
+            let mut state = state.lock().expect("no panic");
+            state.sent.entry(topic).or_default().push(bytes.clone());
+        }
+        let key = Key::new(self.name.clone(), topic).to_string();
+        self.session.put(key, bytes).await.expect("sent");
     }
 }
 
@@ -476,9 +457,60 @@ async fn answer_questions(
         .background()
         .await
         .expect("a queryable");
+    let missing = key(Topic::Missing);
+    let (on, sent) = (missing.clone(), state.clone());
+    session
+        .declare_queryable(&on)
+        .callback(move |query| {
+            let payload = query
+                .payload()
+                .map(|p| p.to_bytes().into_owned())
+                .unwrap_or_default();
+            let Ok((_, request)) = decode::<MissingRequest>(&payload) else {
+                return;
+            };
+            let (session, reply) = send_again(&sent.lock().expect("no panic"), &request);
+            let stamps = Stamps {
+                session,
+                ..Stamps::default()
+            };
+            respond(&query, &missing, encode(&reply, stamps).expect("good"));
+        })
+        .background()
+        .await
+        .expect("a queryable");
     for topic in [Topic::CmdParams, Topic::CmdPose, Topic::CmdRelocalize] {
         obey_on(session, key(topic), state.clone(), behaviour).await;
     }
+}
+
+/// What is missing, as much of it as is asked for at once.
+fn send_again(state: &CarState, request: &MissingRequest) -> (u64, MissingReply) {
+    let kept = state.sent.iter().map(|(&topic, sent)| Kept {
+        topic,
+        first: 1,
+        last: sent.len() as u64,
+    });
+    let mut messages = Vec::new();
+    let mut room = request.budget as usize;
+    for wanted in &request.streams {
+        let sent = state.sent.get(&wanted.topic).into_iter().flatten();
+        for (bytes, number) in sent.zip(1..) {
+            let missing = wanted
+                .ranges
+                .iter()
+                .any(|[from, to]| (*from..=*to).contains(&number));
+            if missing && bytes.len() <= room {
+                room -= bytes.len();
+                messages.push(Resent {
+                    topic: wanted.topic,
+                    bytes: bytes.clone(),
+                });
+            }
+        }
+    }
+    let streams = kept.collect();
+    (state.session, MissingReply { streams, messages })
 }
 
 async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>>, behaviour: Behaviour) {

@@ -71,9 +71,10 @@ fn garbage() -> Vec<Vec<u8>> {
 }
 
 /// What a car is asked or told.
-const ASKED: [Topic; 7] = [
+const ASKED: [Topic; 8] = [
     Topic::Clock,
     Topic::Link,
+    Topic::Missing,
     Topic::CmdParams,
     Topic::CmdPose,
     Topic::CmdRelocalize,

@@ -205,7 +205,12 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
     let (code, said) = say(&endpoint, &["--json", "params", "car-1", "select", "wet"]).await;
     let verdict: serde_json::Value = serde_json::from_str(&said).expect("JSON alone");
     assert_eq!((code, &verdict["verdict"]), (3, &"answered".into()), "{said}");
-    let (code, said) = say(&endpoint, &["--json", "cars"]).await;
+    // On a busy machine a car may send nothing for longer than `cars` listens by itself.
+    wait_until("the car is heard", || {
+        hub.fleet().car(&real).is_some_and(|car| car.pose.is_some())
+    })
+    .await;
+    let (code, said) = say(&endpoint, &["--json", "cars", "--wait", "8"]).await;
     let cars: serde_json::Value = serde_json::from_str(&said).expect("JSON alone");
     let car = cars
         .as_array()

@@ -8,17 +8,18 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, bounded};
 use maps::Pose;
 use protocol::{
-    Action, Answer, Candidate, Command, CommandId, EventKind, Outcome, ParamsAction, RatesAction,
+    Action, Answer, Candidate, Command, CommandId, EventKind, Header, Outcome, ParamsAction, RatesAction,
     RelocalizeAction, Reply, Stamps, Topic, decode, encode,
 };
 use synpf::{Localizer, Parameters, TrackMap, Tuning};
 
-use super::answers::Answers;
+use super::answers::{Answered, Answers, Print};
 use super::file::StateFile;
 use crate::clock::{SensorClock, wall_now};
 use crate::filter::{Order, Shared};
 use crate::keeper::{Decision, Keeper, Plan, Refusal};
 use crate::outbox::Record;
+use crate::sets;
 use crate::shadow::Wish;
 use crate::wire;
 
@@ -59,10 +60,6 @@ pub struct Desk {
     pub track_map: Arc<TrackMap>,
     /// A search of the map answers with what it has after this time.
     pub search_patience: Duration,
-    /// The answer to `map`, encoded.
-    pub map: Vec<u8>,
-    /// The answer to `info`, encoded.
-    pub info: Vec<u8>,
 }
 
 /// The desk at work.
@@ -95,17 +92,11 @@ impl Clerk {
         &self.desk.keeper
     }
 
-    /// The answer to a question or a command, as bytes. An error says what is wrong with a payload that cannot be
-    /// read; it is counted, logged now and then, and changes nothing.
+    /// The answer to a command, as bytes. An error says what is wrong with a payload that cannot be read; it is counted,
+    /// logged now and then, and changes nothing.
     pub fn answer(&mut self, topic: Topic, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
-        match topic {
-            Topic::Map => Ok(self.desk.map.clone()),
-            Topic::Info => Ok(self.desk.info.clone()),
-            _ => match self.command(topic, payload) {
-                Err(error) => Err(self.unreadable(topic, error)),
-                answer => answer,
-            },
-        }
+        self.command(topic, payload)
+            .map_err(|error| self.unreadable(topic, error))
     }
 
     /// Counts what cannot be read, and logs it now and then: a stranger at 100 Hz must not fill the disk.
@@ -125,9 +116,11 @@ impl Clerk {
         if belongs != topic {
             return Err(format!("this command goes under {belongs}, not {topic}"));
         }
+        let print = Print::of(&payload[Header::LEN..]);
         let answer = match self.answers.find(command.id) {
-            Some(answer) => answer.clone(),
-            None => self.obey(&command),
+            Some(given) if given.print.is_none_or(|known| known == print) => given.answer.clone(),
+            Some(_) => self.refuse_used_id(&command),
+            None => self.obey(&command, print),
         };
         let stamps = Stamps {
             session: self.desk.session_number,
@@ -140,7 +133,7 @@ impl Clerk {
     }
 
     /// Does a command that was not done before, and remembers the answer.
-    fn obey(&mut self, command: &Command) -> Answer {
+    fn obey(&mut self, command: &Command, print: Print) -> Answer {
         let mut outcome = match &command.action {
             Action::Params(action) => self.about_sets(command, action),
             Action::Pose(_) | Action::Relocalize(_) | Action::Rates(_) | Action::Auto(_)
@@ -165,17 +158,38 @@ impl Clerk {
             outcome,
             set: self.desk.keeper.reference(),
         };
-        self.answers.remember(answer.clone());
+        let given = Answered {
+            answer: answer.clone(),
+            print: Some(print),
+        };
+        self.answers.remember(given.clone());
         let changes = matches!(
             &command.action,
             Action::Params(action) if !matches!(action, ParamsAction::List | ParamsAction::Shadow { .. })
         );
         if changes && matches!(answer.outcome, Outcome::Done { .. }) {
             // With what it has changed, in one piece.
-            self.desk.keeper.remember(answer.clone());
+            self.desk.keeper.remember(given);
             self.save();
         }
         answer
+    }
+
+    /// Another command under an id that was used already: whoever gave it must not take the first one's answer for its own.
+    fn refuse_used_id(&self, command: &Command) -> Answer {
+        let faults = vec![format!(
+            "the id {} was used for another command already: give this one an id of its own",
+            command.id
+        )];
+        let kind = EventKind::CommandRefused {
+            faults: faults.clone(),
+        };
+        self.event(kind, Some(command));
+        Answer {
+            id: command.id,
+            outcome: Outcome::Refused { faults },
+            set: self.desk.keeper.reference(),
+        }
     }
 
     fn about_sets(&mut self, command: &Command, action: &ParamsAction) -> Outcome {
@@ -205,6 +219,19 @@ impl Clerk {
     /// Stores, swaps, commits, tells: in this order, so that whatever goes wrong, what was in force stays so.
     fn change(&mut self, plan: Plan, who: &str, command: Option<CommandId>) -> Result<u64, Vec<String>> {
         let replaced = plan.store.then(|| self.desk.keeper.store(&plan, who));
+        let stored = replaced.as_ref().map(|replaced| {
+            let in_force = self.desk.keeper.in_force();
+            let (from, before) = replaced.as_ref().map_or_else(
+                || (in_force.name.clone(), &in_force.parameters),
+                |stored| (plan.name.clone(), &stored.parameters),
+            );
+            let changes = sets::changes(before, &plan.parameters);
+            EventKind::SetStored {
+                name: plan.name.clone(),
+                from,
+                changes,
+            }
+        });
         let taken = self.write_memory().and_then(|()| self.swap(&plan));
         let update = match taken {
             Ok(update) => update,
@@ -218,13 +245,12 @@ impl Clerk {
         };
         self.update = update.saturating_sub(1);
         let revert_after = plan.revert_after;
-        let stored = plan.store.then(|| plan.name.clone());
         let falls_back = who == FALL_BACK;
         let now = wall_now();
         let from = self.desk.keeper.commit(plan, who, now, update);
         let to = self.desk.keeper.reference();
-        if let Some(name) = stored {
-            self.event_by(EventKind::SetStored { name }, Some(who), command);
+        if let Some(stored) = stored {
+            self.event_by(stored, Some(who), command);
         }
         let kind = if falls_back {
             EventKind::ParametersFellBack { from, to, update }

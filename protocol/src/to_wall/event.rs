@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Cause, CommandId, Message, Pose2, Rates, Schema, Severity, State};
+use crate::{Cause, CommandId, Message, Pose2, Rates, Schema, Severity, State, Value};
 
 /// Something that happened, at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,6 +26,23 @@ pub struct SetRef {
     pub name: String,
     /// The revision, see [`Params::revision`](crate::Params::revision).
     pub revision: u64,
+}
+
+/// A parameter that has another value.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ValueChange {
+    /// The parameter.
+    pub key: String,
+    /// Its value before.
+    pub before: Value,
+    /// Its value now.
+    pub after: Value,
+}
+
+impl fmt::Display for ValueChange {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {} -> {}", self.key, self.before, self.after)
+    }
 }
 
 /// The kinds of event.
@@ -80,6 +97,11 @@ pub enum EventKind {
     SetStored {
         /// Its name.
         name: String,
+        /// What `changes` compare it with: the set of the same name that it replaces, or, for a new one, the set that was in
+        /// force, of which it keeps what was not given.
+        from: String,
+        /// Every value in which the two differ.
+        changes: Vec<ValueChange>,
     },
     /// A set was deleted from the car.
     SetDeleted {
@@ -180,7 +202,7 @@ pub enum EventKind {
         transit: f32,
         /// Poses per second now [Hz].
         pose: f32,
-        /// The full-rate streams for the recorder go on; if not, a recording has a hole in them that nothing fills.
+        /// The full-rate streams for the recorder go on; if not, the car keeps them, and sends them as the link allows.
         recorded: bool,
     },
     /// The link has recovered: the car sends what it was asked for.
@@ -247,7 +269,7 @@ impl fmt::Display for EventKind {
                 let (from, to) = (set(from), set(to));
                 write!(f, "nobody confirmed {from}: back to {to} from update {update}")
             }
-            Self::SetStored { name } => write!(f, "set {name} stored"),
+            Self::SetStored { name, from, changes } => tell_stored(f, name, from, changes),
             Self::SetDeleted { name } => write!(f, "set {name} deleted"),
             Self::PoseInitialized { before, pose: at } => {
                 write!(f, "initial pose {}", pose(at))?;
@@ -289,7 +311,7 @@ impl fmt::Display for EventKind {
                 let rest = if *recorded {
                     "less of the rest"
                 } else {
-                    "no full-rate streams: recordings have a hole"
+                    "the full-rate streams as the link allows"
                 };
                 write!(
                     f,
@@ -301,8 +323,29 @@ impl fmt::Display for EventKind {
     }
 }
 
+/// Values of a stored set that the text lists.
+const LISTED: usize = 8;
+
+fn tell_stored(f: &mut fmt::Formatter<'_>, name: &str, from: &str, changes: &[ValueChange]) -> fmt::Result {
+    let (stored, but) = if from == name {
+        (format!("set {name} stored in place of what it was"), ": ")
+    } else {
+        (format!("set {name} stored, as {from}"), " but for ")
+    };
+    if changes.is_empty() {
+        return write!(f, "{stored}: no value differs");
+    }
+    let listed: Vec<_> = changes.iter().take(LISTED).map(ToString::to_string).collect();
+    write!(f, "{stored}{but}{}", listed.join(", "))?;
+    match changes.len() - listed.len() {
+        0 => Ok(()),
+        more => write!(f, " and {more} more"),
+    }
+}
+
 impl Message for Event {
     const SCHEMA: Schema = Schema::Event;
     /// 2: what was before a new pose and new rates; whether the full-rate streams go on over a slow link.
-    const VERSION: u16 = 2;
+    /// 3: the values of a stored set that differ.
+    const VERSION: u16 = 3;
 }

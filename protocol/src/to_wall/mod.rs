@@ -13,7 +13,7 @@ mod scan_view;
 mod shadow;
 
 pub use cloud::{Cloud, CloudParticle};
-pub use event::{Event, EventKind, SetRef};
+pub use event::{Event, EventKind, SetRef, ValueChange};
 pub use health::{Cause, CauseKind, Health, Metrics, Proposal, Severity, State};
 pub use info::{CarInfo, ClockReply, ClockRequest};
 pub use load::{Drops, Latency, Load};

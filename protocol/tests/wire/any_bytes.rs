@@ -4,8 +4,8 @@
 
 use protocol::{
     Answer, CarInfo, ClockReply, ClockRequest, Cloud, Command, Event, Header, Health, Key, LinkReport, Load,
-    MapReply, Message, Params, Pose, RecordedOdometry, RecordedScan, ScanView, Schema, Shadow, Stamps,
-    Telemetry, Topic, Truth, decode, encode,
+    MapReply, Message, MissingReply, MissingRequest, Params, Pose, RecordedOdometry, RecordedScan, ScanView,
+    Schema, Shadow, Stamps, Telemetry, Topic, Truth, decode, encode,
 };
 
 /// Checks that nothing but good comes of `data`.
@@ -50,6 +50,8 @@ fn as_everything(bytes: &[u8]) {
     there_and_back::<Command>(bytes);
     there_and_back::<Answer>(bytes);
     there_and_back::<LinkReport>(bytes);
+    there_and_back::<MissingRequest>(bytes);
+    there_and_back::<MissingReply>(bytes);
 }
 
 fn there_and_back<M: Message>(bytes: &[u8]) {

@@ -45,9 +45,31 @@ fn header() {
 #[test]
 fn schemas_keep_their_numbers() {
     let ids: Vec<_> = Schema::ALL.iter().map(|&schema| schema as u16).collect();
-    assert_eq!(ids, (1..=18).collect::<Vec<_>>());
+    assert_eq!(ids, (1..=20).collect::<Vec<_>>());
     assert_eq!(Schema::from_id(7), Some(Schema::Event));
     assert_eq!(Schema::from_id(0), None);
+}
+
+/// Topics travel in questions for what is missing.
+#[test]
+fn topics_keep_their_numbers() {
+    let tags: Vec<_> = Topic::all()
+        .map(|topic| {
+            let request = MissingRequest {
+                session: 0,
+                streams: vec![Wanted {
+                    topic,
+                    ranges: Vec::new(),
+                }],
+                budget: 0,
+            };
+            let bytes = encode(&request, STAMPS).expect("a good message");
+            // Session 8, the list's length 8.
+            let tag = bytes[Header::LEN + 16..].first_chunk().expect("a tag");
+            u32::from_le_bytes(*tag)
+        })
+        .collect();
+    assert_eq!(tags, (0..24).collect::<Vec<_>>());
 }
 
 #[test]
@@ -111,5 +133,7 @@ payloads! {
     command: samples::command(samples::actions().swap_remove(1));
     shadow: samples::shadow();
     link_report: LinkReport { transit: 0.25, uncertainty: 0.125, poses: 40 };
+    missing_request: samples::missing_request();
+    missing_reply: samples::missing_reply();
     answer: samples::answer(samples::outcomes().swap_remove(1));
 }

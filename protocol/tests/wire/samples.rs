@@ -269,7 +269,15 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
         },
         EventKind::ParametersConfirmed { set: to.clone() },
         EventKind::ParametersFellBack { from, to, update },
-        EventKind::SetStored { name: name.clone() },
+        EventKind::SetStored {
+            name: name.clone(),
+            from: "hq".into(),
+            changes: vec![ValueChange {
+                key: "max_particles".into(),
+                before: Value::Int(3000),
+                after: Value::Int(1500),
+            }],
+        },
         EventKind::SetDeleted { name },
         EventKind::PoseInitialized {
             before: Some(POSE),
@@ -472,11 +480,46 @@ pub(crate) fn all() -> Vec<Vec<u8>> {
             uncertainty: 0.125,
             poses: 40,
         }),
+        bytes(&missing_request()),
+        bytes(&missing_reply()),
     ];
     all.extend(event_kinds().into_iter().map(|kind| bytes(&event(kind))));
     all.extend(actions().into_iter().map(|action| bytes(&command(action))));
     all.extend(outcomes().into_iter().map(|outcome| bytes(&answer(outcome))));
     all
+}
+
+/// Two streams, the first with two holes.
+pub(crate) fn missing_request() -> MissingRequest {
+    MissingRequest {
+        session: 7,
+        streams: vec![
+            Wanted {
+                topic: Topic::Event,
+                ranges: vec![[1, 2], [5, 5]],
+            },
+            Wanted {
+                topic: Topic::RecordedScan,
+                ranges: Vec::new(),
+            },
+        ],
+        budget: 6000,
+    }
+}
+
+/// One message of a stream of five.
+pub(crate) fn missing_reply() -> MissingReply {
+    MissingReply {
+        streams: vec![Kept {
+            topic: Topic::Event,
+            first: 1,
+            last: 5,
+        }],
+        messages: vec![Resent {
+            topic: Topic::Event,
+            bytes: vec![1, 2, 3],
+        }],
+    }
 }
 
 pub(crate) fn any_number() -> impl Strategy<Value = f64> {

@@ -1,0 +1,596 @@
+//! What of the streams that must be whole has not come, and what to ask the cars for. Pure: the caller brings the time and
+//! carries questions and answers.
+//!
+//! ```text
+//! messages --> arrive --> those that are in order                   (others are held back for a while)
+//! time     --> due    --> questions to cars --> answered: what came, what the car still keeps, its last numbers
+//! ```
+//!
+//! One question per car is on its way at a time, and its answer is short: over a slow link it takes no more than its share,
+//! over a fast one the next follows at once.
+
+use std::collections::BTreeMap;
+
+use protocol::{CarName, Kept, MissingRequest, Topic, Wanted};
+
+/// Messages of a stream that are asked for when its sender is found; of events all.
+const HISTORY: u64 = 100;
+/// What comes after a gap is held back for so long, for the gap to be filled [ns].
+const HOLD: i64 = 5 * SECOND;
+/// A car is asked this often for its last numbers: a message that was lost is not missed until the next one comes [ns].
+const POLL: i64 = SECOND;
+/// Where nobody answered, the next question waits for so long [ns].
+const AGAIN: i64 = SECOND / 3;
+/// A message that was sent is on its way for so long before it counts as missing [ns].
+const ON_ITS_WAY: i64 = SECOND;
+/// Bounds of what an answer may hold [bytes], and the round trip between which it grows and shrinks [ns].
+const BUDGET: [u32; 2] = [4_000, 48_000];
+const ROUND_TRIP: [i64; 2] = [SECOND / 20, SECOND / 5];
+/// A stream with more gaps than this gives up the oldest: they stay missing.
+const MOST_HOLES: usize = 4096;
+
+const SECOND: i64 = 1_000_000_000;
+
+/// A number in a stream of a car's session.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Place {
+    /// The stream.
+    pub(crate) topic: Topic,
+    /// See [`protocol::Header`].
+    pub(crate) session: u64,
+    /// See [`protocol::Header`]; 0 is not counted.
+    pub(crate) number: u64,
+}
+
+/// A question to put to a car.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Question {
+    /// The car.
+    pub(crate) car: CarName,
+    /// What to ask.
+    pub(crate) request: MissingRequest,
+    /// It is about what an operator looks at, and not only a recorder.
+    pub(crate) urgent: bool,
+}
+
+/// The streams of all cars. `T` is a message.
+#[derive(Debug)]
+pub(crate) struct CatchUp<T> {
+    cars: BTreeMap<CarName, Car<T>>,
+    /// The full-rate streams are wanted, too.
+    recorded: bool,
+}
+
+impl<T> Default for CatchUp<T> {
+    fn default() -> Self {
+        Self {
+            cars: BTreeMap::new(),
+            recorded: false,
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Car<T> {
+    session: Option<u64>,
+    streams: BTreeMap<Topic, Stream<T>>,
+    /// When it was asked what it has not answered yet [unix ns].
+    asked: Option<i64>,
+    /// When to ask next [unix ns].
+    due: i64,
+    budget: u32,
+}
+
+impl<T> Default for Car<T> {
+    fn default() -> Self {
+        Self {
+            session: None,
+            streams: BTreeMap::new(),
+            asked: None,
+            due: 0,
+            budget: BUDGET[0],
+        }
+    }
+}
+
+impl<T> CatchUp<T> {
+    /// Takes note of a car: it is asked what it has.
+    pub(crate) fn appeared(&mut self, car: &CarName) {
+        self.cars.entry(car.clone()).or_default().due = 0;
+    }
+
+    /// Asks for the full-rate streams, too, or no more.
+    pub(crate) fn want_recorded(&mut self, on: bool) {
+        self.recorded = on;
+        for car in self.cars.values_mut() {
+            car.due = 0;
+            if !on {
+                car.streams.retain(|topic, _| !topic.recorded());
+            }
+        }
+    }
+
+    /// Takes in a message that came at `at` [unix ns]. Returns what can be handed on now, in order.
+    pub(crate) fn arrive(&mut self, car: &CarName, place: Place, message: T, at: i64) -> Vec<T> {
+        let Place {
+            topic,
+            session,
+            number,
+        } = place;
+        let car = self.cars.entry(car.clone()).or_default();
+        let mut out = car.follow(session);
+        if number == 0 || car.session.is_some_and(|known| session < known) {
+            out.push(message);
+        } else {
+            let stream = car.streams.entry(topic).or_insert_with(|| Stream::new(false));
+            stream.arrive(topic, number, message, at, &mut out);
+        }
+        out
+    }
+
+    /// What was held back for too long, to be handed on at `now` [unix ns] all the same.
+    pub(crate) fn overdue(&mut self, now: i64) -> Vec<T> {
+        let mut out = Vec::new();
+        for stream in self.cars.values_mut().flat_map(|car| car.streams.values_mut()) {
+            while let Some(oldest) = stream.held.first_entry()
+                && now - oldest.get().0 > HOLD
+            {
+                out.push(oldest.remove().1);
+            }
+        }
+        out
+    }
+
+    /// The questions that are to be put at `now` [unix ns].
+    pub(crate) fn due(&mut self, now: i64) -> Vec<Question> {
+        let recorded = self.recorded;
+        let asked = self.cars.iter_mut().filter_map(|(name, car)| {
+            if car.asked.is_some() || now < car.due {
+                return None;
+            }
+            car.asked = Some(now);
+            let topics = || Topic::all().filter(|topic| topic.recovered());
+            let wanted = |car: &Car<T>, topic| Wanted {
+                topic,
+                ranges: car.streams.get(&topic).map(Stream::wanted).unwrap_or_default(),
+            };
+            let mut streams: Vec<_> = topics()
+                .filter(|topic| !topic.recorded())
+                .map(|topic| wanted(car, topic))
+                .filter(|wanted| !wanted.ranges.is_empty())
+                .collect();
+            // Events tell most and are short.
+            streams.sort_by_key(|wanted| wanted.topic != Topic::Event);
+            let urgent = !streams.is_empty();
+            if !urgent && recorded {
+                let full_rate = topics().filter(|topic| topic.recorded());
+                streams.extend(full_rate.map(|topic| wanted(car, topic)));
+                streams.retain(|wanted| !wanted.ranges.is_empty());
+                // The oldest first, whatever the stream: a recording is of use up to where all of them are whole.
+                streams.sort_by_key(|wanted| car.streams.get(&wanted.topic).map(Stream::since));
+            }
+            let request = MissingRequest {
+                session: car.session.unwrap_or_default(),
+                streams,
+                budget: car.budget,
+            };
+            Some(Question {
+                car: name.clone(),
+                request,
+                urgent,
+            })
+        });
+        asked.collect()
+    }
+
+    /// A car has answered at `now` [unix ns]: what it sent has been taken in, `kept` is what else it said. Returns what need
+    /// not be held back any more.
+    pub(crate) fn answered(
+        &mut self,
+        car: &CarName,
+        session: u64,
+        kept: &[Kept],
+        more: bool,
+        now: i64,
+    ) -> Vec<T> {
+        let recorded = self.recorded;
+        let car = self.cars.entry(car.clone()).or_default();
+        let mut out = car.follow(session);
+        if let Some(asked) = car.asked.take() {
+            let [least, most] = BUDGET;
+            let [short, long] = ROUND_TRIP;
+            car.budget = match now - asked {
+                took if took < short => (2 * car.budget).min(most),
+                took if took > long => (car.budget / 2).max(least),
+                _ => car.budget,
+            };
+        }
+        for kept in kept {
+            if !kept.topic.recovered() || kept.topic.recorded() && !recorded {
+                continue;
+            }
+            let stream = car
+                .streams
+                .entry(kept.topic)
+                .or_insert_with(|| Stream::new(false));
+            stream.kept(*kept, now, &mut out);
+        }
+        let missing = car.streams.values().any(|stream| !stream.holes.is_empty());
+        car.due = match (missing, more) {
+            (true, true) => now,
+            (true, false) => now + AGAIN,
+            (false, _) => now + POLL,
+        };
+        out
+    }
+
+    /// Nobody has answered by `now` [unix ns].
+    pub(crate) fn unanswered(&mut self, car: &CarName, now: i64) {
+        let car = self.cars.entry(car.clone()).or_default();
+        car.asked = None;
+        car.budget = BUDGET[0];
+        car.due = now + AGAIN;
+    }
+}
+
+impl<T> Car<T> {
+    /// Follows a car that began anew; returns what was held back of what it was before.
+    fn follow(&mut self, session: u64) -> Vec<T> {
+        let mut out = Vec::new();
+        match self.session {
+            Some(known) if session <= known => return out,
+            Some(_) => {
+                // What we have followed begins with number 1 again.
+                for stream in self.streams.values_mut() {
+                    let before = std::mem::replace(stream, Stream::new(true));
+                    out.extend(before.held.into_values().map(|(_, message)| message));
+                }
+                self.due = 0;
+            }
+            None => {}
+        }
+        self.session = Some(session);
+        out
+    }
+}
+
+#[derive(Debug)]
+struct Stream<T> {
+    /// Where it begins for us is known; until then everything is held back.
+    begun: bool,
+    /// The highest number that has come or is known to be missing.
+    highest: u64,
+    /// Missing ranges as `[from, to]`, ascending, and since when [unix ns].
+    holes: Vec<([u64; 2], i64)>,
+    /// A number that the car has sent, and since when that is known [unix ns].
+    tail: Option<(u64, i64)>,
+    /// What came after a hole, and when [unix ns].
+    held: BTreeMap<u64, (i64, T)>,
+}
+
+impl<T> Stream<T> {
+    fn new(begun: bool) -> Self {
+        Self {
+            begun,
+            highest: 0,
+            holes: Vec::new(),
+            tail: None,
+            held: BTreeMap::new(),
+        }
+    }
+
+    fn arrive(&mut self, topic: Topic, number: u64, message: T, at: i64, out: &mut Vec<T>) {
+        if self.begun && number <= self.highest {
+            // It fills a hole, or has come already.
+            if !self.fill(number) {
+                return;
+            }
+        } else {
+            if self.begun && number > self.highest + 1 {
+                self.miss([self.highest + 1, number - 1], at);
+            }
+            self.highest = self.highest.max(number);
+        }
+        // Health is shown as it comes: its age tells more than its order.
+        if topic == Topic::Health {
+            out.push(message);
+        } else {
+            self.held.insert(number, (at, message));
+        }
+        self.release(out);
+    }
+
+    /// Takes note of what the car still has.
+    fn kept(&mut self, kept: Kept, now: i64, out: &mut Vec<T>) {
+        let Kept { topic, first, last } = kept;
+        if !self.begun {
+            self.begun = true;
+            let start = if topic == Topic::Event {
+                first
+            } else {
+                first.max((last + 1).saturating_sub(HISTORY))
+            };
+            let mut next = self.held.keys().next().map_or(start, |held| start.min(*held));
+            self.highest = self.highest.max(last);
+            let held: Vec<_> = self.held.keys().copied().chain([self.highest + 1]).collect();
+            for number in held {
+                if number > next {
+                    self.miss([next, number - 1], now);
+                }
+                next = number + 1;
+            }
+        }
+        // What the car no longer has is lost.
+        self.holes.retain_mut(|([from, to], _)| {
+            *from = first.max(*from);
+            from <= to
+        });
+        match self.tail {
+            Some((number, since)) if number > self.highest && now - since >= ON_ITS_WAY => {
+                self.miss([self.highest + 1, number], since);
+                self.highest = number;
+                self.tail = None;
+            }
+            Some((number, _)) if number > self.highest => {}
+            _ => self.tail = (last > self.highest).then_some((last, now)),
+        }
+        self.release(out);
+    }
+
+    /// Hands on what no hole precedes.
+    fn release(&mut self, out: &mut Vec<T>) {
+        if !self.begun {
+            return;
+        }
+        let first_hole = self.holes.first().map_or(u64::MAX, |([from, _], _)| *from);
+        while let Some(next) = self.held.first_entry()
+            && *next.key() < first_hole
+        {
+            out.push(next.remove().1);
+        }
+    }
+
+    fn miss(&mut self, range: [u64; 2], at: i64) {
+        if self.holes.len() == MOST_HOLES {
+            self.holes.remove(0);
+        }
+        self.holes.push((range, at));
+    }
+
+    /// Takes a number out of the missing ones; false when it was none of them.
+    fn fill(&mut self, number: u64) -> bool {
+        let within = |([from, to], _): &([u64; 2], i64)| (*from..=*to).contains(&number);
+        let Some(index) = self.holes.iter().position(within) else {
+            return false;
+        };
+        let ([from, to], since) = self.holes.remove(index);
+        if number < to {
+            self.holes.insert(index, ([number + 1, to], since));
+        }
+        if number > from {
+            self.holes.insert(index, ([from, number - 1], since));
+        }
+        true
+    }
+
+    /// What to ask for: the oldest ranges.
+    fn wanted(&self) -> Vec<[u64; 2]> {
+        let ranges = self.holes.iter().map(|(range, _)| *range);
+        ranges.take(Wanted::MAX_RANGES).collect()
+    }
+
+    /// Since when something has been missing [unix ns].
+    fn since(&self) -> i64 {
+        self.holes.first().map_or(i64::MAX, |(_, since)| *since)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SESSION: u64 = 5;
+    const TOPIC: Topic = Topic::RecordedScan;
+
+    struct Wall {
+        catch_up: CatchUp<u64>,
+        car: CarName,
+        now: i64,
+        out: Vec<u64>,
+    }
+
+    impl Wall {
+        fn new() -> Self {
+            let mut catch_up = CatchUp::default();
+            catch_up.want_recorded(true);
+            let car = CarName::new("car-1").expect("a good name");
+            catch_up.appeared(&car);
+            Self {
+                catch_up,
+                car,
+                now: SECOND,
+                out: Vec::new(),
+            }
+        }
+
+        fn arrive_in(&mut self, session: u64, numbers: impl IntoIterator<Item = u64>) {
+            for number in numbers {
+                let place = Place {
+                    topic: TOPIC,
+                    session,
+                    number,
+                };
+                self.out
+                    .extend(self.catch_up.arrive(&self.car, place, number, self.now));
+            }
+        }
+
+        fn arrive(&mut self, numbers: impl IntoIterator<Item = u64>) {
+            self.arrive_in(SESSION, numbers);
+        }
+
+        /// Asks what is due and answers with the last number, and up to so many messages.
+        fn ask(&mut self, first: u64, last: u64, most: usize) -> Vec<[u64; 2]> {
+            let question = self.catch_up.due(self.now).pop().expect("is due");
+            assert_eq!(self.catch_up.due(self.now), [], "one at a time");
+            let ranges: Vec<_> = question
+                .request
+                .streams
+                .iter()
+                .flat_map(|wanted| wanted.ranges.clone())
+                .collect();
+            let numbers = ranges.iter().flat_map(|[from, to]| *from..=*to);
+            let sent: Vec<_> = numbers
+                .filter(|number| (first..=last).contains(number))
+                .take(most)
+                .collect();
+            self.arrive(sent.clone());
+            let kept = Kept {
+                topic: TOPIC,
+                first,
+                last,
+            };
+            let more = !sent.is_empty();
+            self.out.extend(
+                self.catch_up
+                    .answered(&self.car, SESSION, &[kept], more, self.now),
+            );
+            ranges
+        }
+
+        fn wait(&mut self, seconds: f64) {
+            self.now += (seconds * SECOND as f64) as i64;
+        }
+    }
+
+    #[test]
+    fn a_newcomer_gets_the_last_hundred_in_order() {
+        let mut wall = Wall::new();
+        wall.arrive([300]);
+        assert!(
+            wall.out.is_empty(),
+            "held back until it is known what came before"
+        );
+        assert_eq!(wall.ask(1, 300, 0), [] as [[u64; 2]; 0]);
+        wall.wait(0.5);
+        assert_eq!(wall.ask(1, 300, 1000), [[201, 299]]);
+        assert_eq!(wall.out, (201..=300).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn what_comes_after_a_gap_waits_for_it_and_the_gap_is_asked_for_in_pieces() {
+        let mut wall = Wall::new();
+        wall.ask(1, 1, 1);
+        wall.wait(1.0);
+        wall.ask(1, 1, 1);
+        wall.out.clear();
+        wall.arrive([2, 5, 9]);
+        assert_eq!(wall.out, [2]);
+        wall.wait(1.0);
+        assert_eq!(wall.ask(1, 9, 3), [[3, 4], [6, 8]]);
+        assert_eq!(wall.out, [2, 3, 4, 5, 6]);
+        assert_eq!(wall.ask(1, 9, 3), [[7, 8]], "at once");
+        assert_eq!(wall.out, [2, 3, 4, 5, 6, 7, 8, 9]);
+        wall.arrive([7, 10]);
+        assert_eq!(wall.out.last(), Some(&10), "a second copy is dropped");
+        assert_eq!(wall.out.len(), 9);
+    }
+
+    #[test]
+    fn a_gap_that_nobody_fills_holds_back_for_a_while_only() {
+        let mut wall = Wall::new();
+        wall.arrive([1, 2]);
+        wall.ask(1, 2, 0);
+        wall.arrive([4]);
+        assert_eq!(wall.out, [1, 2]);
+        wall.wait(0.5 + HOLD as f64 / SECOND as f64);
+        assert_eq!(wall.catch_up.overdue(wall.now), [4]);
+        // It is asked for all the same, until the car has it no more.
+        assert_eq!(wall.ask(4, 4, 1), [[3, 3]]);
+        wall.wait(1.0);
+        assert_eq!(wall.ask(4, 4, 1), [] as [[u64; 2]; 0]);
+    }
+
+    #[test]
+    fn the_last_message_lost_is_missed_after_a_second() {
+        let mut wall = Wall::new();
+        wall.arrive([1]);
+        wall.ask(1, 1, 0);
+        wall.wait(1.0);
+        assert_eq!(wall.ask(1, 2, 0), [] as [[u64; 2]; 0], "2 may be on its way");
+        wall.wait(1.0);
+        wall.ask(1, 2, 0);
+        wall.wait(1.0);
+        assert_eq!(wall.ask(1, 2, 1), [[2, 2]]);
+        assert_eq!(wall.out, [1, 2]);
+    }
+
+    #[test]
+    fn a_car_that_begins_anew_begins_with_one() {
+        let mut wall = Wall::new();
+        wall.arrive([1]);
+        wall.ask(1, 1, 0);
+        wall.arrive([3]);
+        wall.arrive_in(SESSION + 1, [2]);
+        assert_eq!(wall.out, [1, 3], "what was held back is all there will be");
+        let question = wall.catch_up.due(wall.now).pop().expect("is due");
+        assert_eq!(question.request.session, SESSION + 1);
+        assert_eq!(question.request.streams[0].ranges, [[1, 1]]);
+        wall.arrive_in(SESSION, [2]);
+        assert_eq!(wall.out, [1, 3, 2], "a straggler");
+        wall.arrive_in(SESSION + 1, [1]);
+        assert_eq!(wall.out, [1, 3, 2, 1, 2]);
+    }
+
+    #[test]
+    fn answers_grow_on_a_fast_link_and_shrink_on_a_slow_one() {
+        let mut wall = Wall::new();
+        let budgets: Vec<_> = [0.001, 0.01, 0.001, 0.01, 0.1, 0.5, 0.5, 3.0]
+            .map(|took| {
+                wall.wait(2.0);
+                let question = wall.catch_up.due(wall.now).pop().expect("is due");
+                wall.wait(took);
+                wall.catch_up.answered(&wall.car, SESSION, &[], false, wall.now);
+                question.request.budget
+            })
+            .to_vec();
+        assert_eq!(
+            budgets,
+            [4000, 8000, 16_000, 32_000, 48_000, 48_000, 24_000, 12_000]
+        );
+        wall.wait(2.0);
+        wall.catch_up.due(wall.now);
+        wall.catch_up.unanswered(&wall.car, wall.now);
+        wall.wait(1.0);
+        assert_eq!(wall.catch_up.due(wall.now)[0].request.budget, 4000);
+    }
+
+    /// Whatever is lost, repeated and answered late: in the end each has been handed on, each once.
+    #[test]
+    fn nothing_is_lost_and_nothing_comes_twice() {
+        for seed in 0..50_u64 {
+            let mut dice = seed;
+            let mut roll = move |sides: u64| {
+                dice = dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                (dice >> 33) % sides
+            };
+            let mut wall = Wall::new();
+            wall.ask(1, 1, 1);
+            for number in 2..=300 {
+                wall.wait(0.025);
+                if roll(3) > 0 {
+                    wall.arrive([number]);
+                }
+                if roll(4) == 0 && wall.now >= wall.catch_up.cars[&wall.car].due {
+                    let most = roll(5) as usize;
+                    wall.ask(1, number, most);
+                }
+            }
+            for _ in 0..300 {
+                wall.wait(1.1);
+                wall.ask(1, 300, 7);
+            }
+            assert_eq!(wall.out, (1..=300).collect::<Vec<_>>(), "seed {seed}");
+        }
+    }
+}

@@ -170,6 +170,15 @@ fn map_building(criterion: &mut Criterion) {
             },
         );
     });
+    let drive = Drive::new(&ring(), Parameters::named("hq").expect("ships"));
+    let scan = &drive.scans[drive.step % drive.scans.len()];
+    group.bench_function("look for the scan on the whole map", |bencher| {
+        bencher.iter_batched_ref(
+            || drive.localizer.clone(),
+            |localizer| localizer.run_stage(Stage::Look, scan),
+            BatchSize::SmallInput,
+        );
+    });
     group.finish();
 }
 

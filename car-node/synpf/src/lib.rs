@@ -17,6 +17,7 @@ mod range_table;
 mod recovery;
 mod refine;
 mod search;
+mod seed;
 mod sensor;
 mod slip;
 mod slip_model;

@@ -1,13 +1,10 @@
 //! The search of the whole map: candidates from one scan, told apart by motion.
 //!
 //! A single scan is not safe: on a track the best and the second-best pose often tie. So the scan is matched
-//! against the distance field everywhere (after Olson, ICRA 2009, with one coarse level and Gauss-Newton in place
-//! of the fine ones), the best candidates are kept, and each follows odometry and the next scans on its own until
-//! one of them explains all of it clearly better than the rest.
+//! against the map everywhere ([`crate::seed`]), the best candidates are kept, and each follows odometry and the next scans on
+//! its own until one of them explains all of it clearly better than the rest.
 
-use std::cmp::Ordering;
-
-use maps::{DistanceField, OccupancyGrid, Pose, wrap_angle};
+use maps::{Pose, wrap_angle};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -15,7 +12,8 @@ use serde::{Deserialize, Serialize};
 use crate::TrackMap;
 use crate::beams::ReadyScan;
 use crate::parameters::{Check, Parameters};
-use crate::refine::{Estimate, fit, refine};
+use crate::refine::{Estimate, RefinementParameters, fit, refine};
+use crate::seed::seed;
 use crate::surprise::Fall;
 
 /// Parameters of the search.
@@ -91,11 +89,8 @@ const SAME: [f64; 2] = [0.3, 0.2];
 /// Beams that the score looks at.
 const BEAMS: usize = 60;
 
-/// Beams that the coarse match looks at.
-const COARSE_BEAMS: usize = 36;
-
-/// Coarse poses that are looked through for the best of each neighbourhood.
-const COARSE: usize = 6000;
+/// Beams that a seed is fitted with: there are many seeds, and those that stay are fitted to every beam of the next scans.
+const FITTED_BEAMS: usize = 180;
 
 /// Neighbouring beams err together: the score counts this many as independent.
 const INDEPENDENT: f64 = 20.0;
@@ -137,7 +132,7 @@ impl Search {
         let explained = self.candidates.iter().any(|candidate| explains(candidate.score));
         if self.candidates.is_empty() || self.since_seeding >= RESEED[usize::from(explained)] {
             self.since_seeding = 0.0;
-            self.candidates.extend(seed(map, scan, parameters));
+            self.candidates.extend(candidates(map, scan, parameters));
         }
         self.rank(parameters.search.search_candidates);
         self.confirmed(parameters)
@@ -192,7 +187,7 @@ impl Search {
         parameters: &Parameters,
     ) -> Option<Self> {
         let mut search = Self {
-            candidates: seed(map, scan, parameters),
+            candidates: candidates(map, scan, parameters),
             ..Self::default()
         };
         search.rank(parameters.search.search_candidates);
@@ -249,20 +244,32 @@ pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
     fit(map.field(), &scan.points, BEAMS, pose, 0.08)
 }
 
-/// The fit of a scan near a pose that is known only coarsely.
+/// Candidates from one scan alone.
+fn candidates(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candidate> {
+    seed(map, &scan.points, &parameters.search)
+        .into_par_iter()
+        .map(|pose| {
+            let estimate = fitted(map, scan, pose, parameters);
+            Candidate {
+                estimate,
+                score: score(map, scan, estimate.pose),
+                scans: 1,
+            }
+        })
+        .collect()
+}
+
+/// The fit of part of a scan near a pose that is known only coarsely.
 fn fitted(map: &TrackMap, scan: &ReadyScan, pose: Pose, parameters: &Parameters) -> Estimate {
     let prior = Estimate {
         pose,
         covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
     };
-    refine(
-        map.field(),
-        &scan.points,
-        pose,
-        &prior,
-        0.0,
-        &parameters.refinement,
-    )
+    let parameters = RefinementParameters {
+        refine_beams: parameters.refinement.refine_beams.min(FITTED_BEAMS),
+        ..parameters.refinement.clone()
+    };
+    refine(map.field(), &scan.points, pose, &prior, 0.0, &parameters)
 }
 
 fn same(a: Pose, b: Pose) -> bool {
@@ -279,163 +286,4 @@ fn score(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
         return INDEPENDENT * 0.02f64.ln();
     }
     INDEPENDENT * fit_of(map, scan, pose).max(0.02).ln()
-}
-
-/// How near a wall is, coarsely and in few bytes, so that a whole map stays in a processor's cache while every
-/// pose is tried on it.
-#[derive(Debug)]
-pub(crate) struct CoarseField {
-    width: usize,
-    /// 255 on a wall, a half at [`COARSE_REACH`], falling to 0.
-    nearness: Vec<u8>,
-    /// Edge of a coarse cell [m].
-    resolution: f32,
-}
-
-/// Distance from a wall at which an end point counts half in the coarse match [m]: as far off as a coarse pose is.
-const COARSE_REACH: f32 = 0.2;
-
-/// Coarse cells are at least this large [m].
-const COARSE_CELL: f64 = 0.1;
-
-impl CoarseField {
-    pub(crate) fn new(grid: &OccupancyGrid, field: &DistanceField) -> Self {
-        let factor = (COARSE_CELL / grid.resolution).round().max(1.0) as usize;
-        let (width, height) = (grid.width.div_ceil(factor), grid.height.div_ceil(factor));
-        let nearest = |index: usize| {
-            let (column, row) = (index % width * factor, index / width * factor);
-            let columns = column..(column + factor).min(grid.width);
-            let rows = row..(row + factor).min(grid.height);
-            let cells = rows.flat_map(|row| columns.clone().map(move |column| row * grid.width + column));
-            cells
-                .map(|cell| field.values()[cell].abs())
-                .fold(f32::INFINITY, f32::min)
-        };
-        let nearness = (0..width * height)
-            .map(|index| {
-                let ratio = nearest(index) / COARSE_REACH;
-                (255.0 / (1.0 + ratio * ratio)) as u8
-            })
-            .collect();
-        Self {
-            width,
-            nearness,
-            resolution: (grid.resolution * factor as f64) as f32,
-        }
-    }
-
-    /// Nearness at a point in coarse cells, 0 outside.
-    #[inline]
-    fn at(&self, u: f32, v: f32) -> u32 {
-        // Negative coordinates become 0 and lie outside or in the rim; a column beyond the width is caught.
-        let (column, row) = (u as usize, v as usize);
-        if column >= self.width || u < 0.0 || v < 0.0 {
-            return 0;
-        }
-        self.nearness
-            .get(row * self.width + column)
-            .map_or(0, |&nearness| u32::from(nearness))
-    }
-}
-
-/// Least mean nearness of a coarse pose that is looked at again.
-const LEAST_NEARNESS: f32 = 0.3;
-
-/// Candidates from one scan alone: every position and heading tried coarsely, the best refined.
-fn seed(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candidate> {
-    let field = map.field();
-    let coarse_field = map.coarse_field();
-    let resolution = map.grid().resolution;
-    let width = map.grid().width;
-    let step = (parameters.search.search_step / resolution).round().max(1.0) as usize;
-    let clearance = 0.12f32;
-    let per_cell = resolution as f32 / coarse_field.resolution;
-    let positions: Vec<[f32; 2]> = map
-        .plausible_regions()
-        .into_iter()
-        .flat_map(|region| map.regions()[region].cells.iter())
-        .map(|&cell| (cell as usize % width, cell as usize / width, cell as usize))
-        .filter(|&(column, row, cell)| {
-            column % step == 0 && row % step == 0 && field.values()[cell] > clearance
-        })
-        .map(|(column, row, _)| [(column as f32 + 0.5) * per_cell, (row as f32 + 0.5) * per_cell])
-        .collect();
-    let headings = (std::f64::consts::TAU / parameters.search.search_turn).ceil() as usize;
-    let stride = scan.points.len().div_ceil(COARSE_BEAMS).max(1);
-    // Spread over the field of view in both halves, so that a look at the first half tells.
-    let looked_at = || scan.points.iter().step_by(stride);
-    let ordered: Vec<[f32; 2]> = looked_at()
-        .step_by(2)
-        .chain(looked_at().skip(1).step_by(2))
-        .copied()
-        .collect();
-    let cells = 1.0 / coarse_field.resolution;
-    let half = ordered.len() / 2;
-    let least = |points: usize| (LEAST_NEARNESS * 255.0 * points as f32) as u32;
-    let mut coarse: Vec<(u32, Pose)> = (0..headings)
-        .into_par_iter()
-        .flat_map_iter(|k| {
-            let heading = k as f64 / headings as f64 * std::f64::consts::TAU;
-            let (sin, cos) = (heading.sin() as f32 * cells, heading.cos() as f32 * cells);
-            let turned: Vec<[f32; 2]> = ordered
-                .iter()
-                .map(|p| [cos * p[0] - sin * p[1], sin * p[0] + cos * p[1]])
-                .collect();
-            let sum = |at: &[f32; 2], points: &[[f32; 2]]| -> u32 {
-                points
-                    .iter()
-                    .map(|point| coarse_field.at(at[0] + point[0], at[1] + point[1]))
-                    .sum()
-            };
-            let mut good = Vec::new();
-            for at in &positions {
-                let first = sum(at, &turned[..half]);
-                // Most poses are hopeless after half of the beams.
-                if first * 3 < least(half) * 2 {
-                    continue;
-                }
-                let whole = first + sum(at, &turned[half..]);
-                if whole >= least(turned.len()) {
-                    let [x, y] = at.map(|v| f64::from(v * coarse_field.resolution));
-                    good.push((whole, Pose::new(x, y, heading)));
-                }
-            }
-            good
-        })
-        .collect();
-    if coarse.len() > COARSE {
-        coarse.select_nth_unstable_by(COARSE, |a, b| b.0.cmp(&a.0));
-        coarse.truncate(COARSE);
-    }
-    // Ties in the order of the poses, which does not depend on the number of threads.
-    let key = |pose: &Pose| [pose.x, pose.y, pose.heading];
-    coarse.sort_by(|a, b| {
-        b.0.cmp(&a.0)
-            .then_with(|| key(&a.1).partial_cmp(&key(&b.1)).unwrap_or(Ordering::Equal))
-    });
-    // The best of each neighbourhood.
-    let most = 3 * parameters.search.search_candidates;
-    let mut picked: Vec<Pose> = Vec::with_capacity(most);
-    for (_, pose) in coarse {
-        let near = |other: &Pose| {
-            other.distance(pose) < 0.45 && wrap_angle(other.heading - pose.heading).abs() < 0.3
-        };
-        if !picked.iter().any(near) {
-            picked.push(pose);
-            if picked.len() == most {
-                break;
-            }
-        }
-    }
-    picked
-        .into_par_iter()
-        .map(|pose| {
-            let estimate = fitted(map, scan, pose, parameters);
-            Candidate {
-                estimate,
-                score: score(map, scan, estimate.pose),
-                scans: 1,
-            }
-        })
-        .collect()
 }

@@ -7,7 +7,7 @@ use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::range_table::{RangeTable, TableParameters};
-use crate::search::CoarseField;
+use crate::seed::Blurred;
 use crate::sensor::RangeMethod;
 use crate::{Parameters, SetUpError};
 
@@ -26,7 +26,7 @@ pub struct TrackMap {
     region_of: Vec<u16>,
     tables: Mutex<HashMap<(usize, TableParameters), Arc<RangeTable>>>,
     cddt: OnceLock<Arc<Cddt>>,
-    coarse_field: OnceLock<CoarseField>,
+    blurred: OnceLock<Blurred>,
 }
 
 /// A connected piece of free space.
@@ -67,7 +67,7 @@ impl TrackMap {
             region_of,
             tables: Mutex::default(),
             cddt: OnceLock::new(),
-            coarse_field: OnceLock::new(),
+            blurred: OnceLock::new(),
         })
     }
 
@@ -150,9 +150,8 @@ impl TrackMap {
         inside(at.x, self.grid.width) && inside(at.y, self.grid.height)
     }
 
-    pub(crate) fn coarse_field(&self) -> &CoarseField {
-        self.coarse_field
-            .get_or_init(|| CoarseField::new(&self.grid, &self.field))
+    pub(crate) fn blurred(&self) -> &Blurred {
+        self.blurred.get_or_init(|| Blurred::new(&self.grid, &self.field))
     }
 
     pub(crate) fn grid_from_map(&self) -> Pose {

@@ -7,6 +7,7 @@ use crate::Scan;
 use crate::motion::Motion;
 use crate::particles::Belief;
 use crate::quality::Quality;
+use crate::seed::seed;
 
 /// A part of [`Localizer::on_scan`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -25,10 +26,12 @@ pub enum Stage {
     Judge,
     /// Systematic resampling of all particles.
     Resample,
+    /// A look at the whole map for where the scan may have been taken; part of a search, not of an update.
+    Look,
 }
 
 impl Stage {
-    /// In the order of an update.
+    /// Those of an update, in its order.
     pub const ALL: [Self; 7] = [
         Self::Deskew,
         Self::Move,
@@ -83,6 +86,9 @@ impl Localizer {
                     self.estimate.pose,
                     self.base_link_from_laser,
                 ));
+            }
+            Stage::Look => {
+                std::hint::black_box(seed(&self.map, &self.scan.points, &self.parameters.search));
             }
             Stage::Resample => {
                 let count = self.particles.len();

@@ -101,7 +101,7 @@ impl DistanceField {
         })
     }
 
-    /// The sample of the cell that holds a point in grid coordinates [m]; None outside the grid.
+    /// The sample of the cell that holds a point in grid coordinates [cells], in metres; None outside the grid.
     #[inline]
     pub fn nearest(&self, u: f32, v: f32) -> Option<f32> {
         if !(u >= 0.0 && v >= 0.0) {

@@ -89,8 +89,9 @@ impl Surprise {
             let off = correction[k].min(JUMP * self.corrections[k].max(LEAST_CORRECTION[k]));
             self.corrections[k] += alpha * (off - self.corrections[k]);
         }
-        // What is a surprise is not usual, and counts no more than the least surprise does.
-        let fit = fit.max(mean - parameters.surprise * variation.max(LEAST_VARIATION));
+        // After a jump what is a surprise is not usual, and counts no more than the least surprise does.
+        let least = mean - parameters.surprise * variation.max(LEAST_VARIATION);
+        let fit = if self.jumped > 0 { fit.max(least) } else { fit };
         let off = (fit - mean).abs();
         self.usual = Some([mean + alpha * (fit - mean), variation + alpha * (off - variation)]);
     }

@@ -584,14 +584,12 @@ impl Localizer {
             self.w_ratio = self
                 .doubt
                 .push(quality.clear_alignment().max(0.02), quality.alignment, recovery);
-            // The mean of the particles jitters more than a jump is high.
-            let correction = if self.parameters.refinement.refine {
-                [innovation.y.abs(), innovation.heading.abs()]
-            } else {
-                [0.0; 2]
-            };
-            let fit = fit_of(&self.map, &self.scan, self.estimate.pose);
-            self.surprise.push(fit, correction, recovery);
+            // The mean of the particles jitters too much for a slight fall to say anything.
+            if self.parameters.refinement.refine {
+                let correction = [innovation.y.abs(), innovation.heading.abs()];
+                let fit = fit_of(&self.map, &self.scan, self.estimate.pose);
+                self.surprise.push(fit, correction, recovery);
+            }
             let lost = self.settled > 10
                 && self.doubt.lost(
                     quality.clear_alignment(),

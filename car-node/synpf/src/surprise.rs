@@ -4,7 +4,9 @@
 //! end points on walls, so that no limit on alignment shows it, but the fit falls by many times its own variation, from one
 //! scan to the next; or it jumps to the side or turns, which no straight hides, and then stays a little worse than usual: evidence
 //! of that is summed up (Page's cumulative sum; Biometrika 41, 1954). Without the jump a slight fall says nothing: a pose
-//! that is a little too far on looks the same. Nor does it on a map that fits badly, whose fit varies from place to place.
+//! that is a little too far on looks the same, and a wall that runs along the grid stands up to half a cell off over its whole
+//! length (in `hall` other places fit the right pose's scans better for seconds). Nor does it on a map that fits badly, whose
+//! fit varies from place to place.
 
 use crate::recovery::RecoveryParameters;
 

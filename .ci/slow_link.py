@@ -2,10 +2,13 @@
 
     python3 .ci/slow_link.py PATH/TO/car-node PATH/TO/pitwall [LOSS [DELAY]]
 
-The radio is made here, of two TUN devices: a rate, a delay, packets lost at random, and an outage. What is checked: the
-filter misses no update, commands are answered or said not to be, the pit wall says BLIND and recovers, and the recording
-holds every message of the streams that must be whole, or names what it does not hold. Needs root and /dev/net/tun; where it
-cannot have them, it says so and ends with 0. `unshare -Urn` gives a user both.
+The radio is made here, of two TUN devices: a rate, a delay, packets lost at random, and an outage. 1 Mbit/s, 50 ms and 5 %
+are worse than a noisy WiFi, which sends again by itself what it loses; TCP (cubic, what most systems use) gets some
+0.4 Mbit/s through, a third of what a car at full rate sends. What is checked: commands are answered, and without a link
+said not to be; the pit wall says BLIND and recovers; no health and no event is missing in the end; the recording names what
+it does not hold, and once the radio is good it holds the full-rate streams, too; the filter misses no update, unless the
+machine has no time for it. Needs root and /dev/net/tun; where it cannot have them, it says so and ends with 0.
+`unshare -Urn` gives a user both.
 """
 
 import contextlib
@@ -30,10 +33,19 @@ DELAY = 0.050  # s, each way
 LOSS = 0.05  # share of the packets
 QUEUE = 0.200  # s of the rate: what waits longer is dropped, as a radio's driver does
 OUTAGE = 5.0  # s
+GOOD = (50e6, 0.002, 0.0)  # rate, delay and loss of a good radio
 CAR, WALL = "10.77.0.1", "10.77.0.2"
 PORT = 7447
+# Streams of which in the end nothing may be missing.
+WHOLE = ("health", "event", *(f"recorded_{stream}" for stream in ("pose", "health", "odometry", "scan", "truth")))
+# The car takes so long to send everything again once the radio is good [s].
+SETTLE = 8.0
 # Bounded, whatever hangs.
 LONGEST = 120
+
+CONGESTION_CONTROL = "/proc/sys/net/ipv4/tcp_congestion_control"
+# A machine that is busier than this has no time for the filter, whatever the link does.
+BUSY = 0.85
 
 TUNSETIFF, IFF_TUN_NO_PI = 0x400454CA, 0x1001
 
@@ -46,7 +58,11 @@ class Radio(threading.Thread):
         self.names = [f"{tag}c", f"{tag}w"]
         self.ends = [tun(name) for name in self.names]
         self.out = self.ended = False
+        self.rate, self.delay, self.loss = RATE, DELAY, LOSS
         self.carried = self.lost = 0
+
+    def become_good(self):
+        self.rate, self.delay, self.loss = GOOD
 
     def run(self):
         dice = random.Random(1)
@@ -60,12 +76,12 @@ class Radio(threading.Thread):
                 packet = os.read(end, 4096)
                 side = self.ends.index(end)
                 began = max(now, free[side])
-                if self.out or dice.random() < LOSS or began - now > QUEUE:
+                if self.out or dice.random() < self.loss or began - now > QUEUE:
                     self.lost += 1
                     continue
-                free[side] = began + 8 * len(packet) / RATE
-                heapq.heappush(due, (free[side] + DELAY, next(count), self.ends[1 - side], packet))
-            while due and due[0][0] <= now:
+                free[side] = began + 8 * len(packet) / self.rate
+                heapq.heappush(due, (free[side] + self.delay, next(count), self.ends[1 - side], packet))
+            while due and due[0][0] <= time.monotonic():
                 _, _, end, packet = heapq.heappop(due)
                 if not self.out:
                     with contextlib.suppress(OSError):
@@ -131,6 +147,9 @@ def main(node, wall):
                 ip("-n", space, "addr", "add", own, "peer", other, "dev", name)
                 ip("-n", space, "link", "set", name, "up")
                 ip("-n", space, "link", "set", "lo", "up")
+                # Whatever this system uses by itself: some get through loss what others do not.
+                with contextlib.suppress(subprocess.CalledProcessError):
+                    ip("netns", "exec", space, "sh", "-c", f"echo cubic > {CONGESTION_CONTROL}")
         except (OSError, subprocess.CalledProcessError) as error:
             return skip(f"no namespaces or TUN devices here: {getattr(error, 'stderr', None) or error}")
         radio.start()
@@ -158,6 +177,12 @@ def main(node, wall):
         alarm.start()
         stack.callback(alarm.cancel)
         return drive(radio, start, node, wall, car_side, wall_side, folder)
+
+
+def loads(views):
+    """What the car has said of its load."""
+    cars = (next((car for car in view if car["car"] == "car-1"), {}) for _, view in views.seen)
+    return [car["load"] for car in cars if car.get("load")]
 
 
 def drive(radio, start, node, wall, car_side, wall_side, folder):
@@ -192,10 +217,18 @@ def drive(radio, start, node, wall, car_side, wall_side, folder):
     first = views.wait("localized", lambda view: (car(view) or {}).get("state") == "LOCALIZED", 30)
     check(first, "the car was never localized")
     print(f"on the slow link: {RATE / 1e6:.0f} Mbit/s, {DELAY * 1e3:.0f} ms each way, {LOSS:.0%} lost", flush=True)
+
+    def select(name):
+        """As an operator would: who gets no answer gives the command again."""
+        for _ in range(3):
+            code, said, took = command("params", "car-1", "select", name)
+            print(f"  select {name}: exit code {code} after {took:.1f} s", flush=True)
+            if code == 0:
+                return
+        check(False, f"select {name} ended with {code}: {said}")
+
     for name in ("lq", "hq"):
-        code, said, took = command("params", "car-1", "select", name)
-        print(f"  select {name}: exit code {code} after {took:.1f} s", flush=True)
-        check(code in (0, 5), f"select {name} ended with {code}: {said}")
+        select(name)
     # Down for a while: first there is no answer, then nobody to ask.
     print(f"nothing gets through for {OUTAGE:.0f} s", flush=True)
     radio.out = True
@@ -210,27 +243,32 @@ def drive(radio, start, node, wall, car_side, wall_side, folder):
     print("the link is back", flush=True)
     back = views.wait("seen again", lambda view: car(view)["alive"] and not car(view)["blind"], 15)
     check(back, "the pit wall did not see the car again")
-    code, said, took = command("params", "car-1", "select", "lq")
-    for _ in range(3):
-        if code == 0:
-            break
-        code, said, took = command("params", "car-1", "select", "lq")
-    check(code == 0, f"select lq ended with {code} with the link back: {said}")
+    select("lq")
 
     def whole(view):
         return all(car(view)["streams"][topic]["missing"] == 0 for topic in ("health", "event"))
 
-    last = views.wait("no health and no event missing", whole, 15)
+    last = views.wait("no health and no event missing", whole, 20)
     check(last, "health or events are missing")
     last = car(last or views.seen[-1][1])
     load = last["load"]
     print(f"  updates {load['update_rate']:.1f}/s of scans {load['scan_rate']:.1f}/s, drops {load['drops']}")
+    cores = [sum(load["cpu_cores"]) / len(load["cpu_cores"]) for load in loads(views)]
+    busy = sum(cores) / len(cores)
+    print(f"  the machine was busy for {busy:.0%}")
     # Telemetry is what may be dropped; a scan is not. An update or two may be under way when the load is read.
     lost = {cause: count for cause, count in load["drops"].items() if count and cause != "telemetry"}
-    check(not lost, f"the filter has missed input: {lost}")
-    check(load["update_rate"] > load["scan_rate"] - 2.5, "fewer updates than scans")
+    behind = load["update_rate"] < load["scan_rate"] - 2.5
+    if busy < BUSY:
+        check(not lost, f"the filter has missed input: {lost}")
+        check(not behind, "fewer updates than scans")
+    elif lost or behind:
+        print("  too busy for the filter: that it has missed input says nothing about the link")
+    print("the radio is good now", flush=True)
+    radio.become_good()
+    time.sleep(SETTLE)
     record.send_signal(signal.SIGINT)
-    said, _ = record.communicate(timeout=30)
+    said, _ = record.communicate(timeout=40)
     summary = json.loads(said)
     print(f"the recording, with {radio.carried} packets carried and {radio.lost} lost:")
     for stream in summary["streams"]:
@@ -240,7 +278,7 @@ def drive(radio, start, node, wall, car_side, wall_side, folder):
         late = stream["filled_late"]
         print(f"  {topic:<18} {first} to {last}: {received} received, {late} of them late, {missing} missing")
         check(received + missing == last - first + 1, f"{topic}: the sum is wrong")
-        check(missing == 0 or topic not in ("health", "event"), f"{topic}: {missing} missing")
+        check(missing == 0 or topic not in WHOLE, f"{topic}: {missing} missing")
     return faults
 
 

@@ -352,8 +352,8 @@ fn rubbish_is_refused_and_the_car_drives_on() {
     }
     let (_, seen) = next::<protocol::Load>(&load, |load| load.drops.payloads >= sent);
     assert_eq!(seen.drops.payloads, sent);
-    let (_, seen) = next::<protocol::Load>(&load, |_| true);
-    assert!(seen.update_rate > 30.0, "{seen:?}");
+    // Its rate is what it was, as soon as the machine has the time.
+    next::<protocol::Load>(&load, |load| load.update_rate > 30.0);
 
     // A command under another command's key, and one for all cars at once.
     let command = Command {

@@ -249,10 +249,17 @@ impl Car {
         let blind = self.blind(now);
         let quiet_s = seconds(now - self.last_heard).max(0.0);
         let (state, causes) = match &self.health {
-            _ if blind => (
-                "BLIND".to_owned(),
-                vec![format!("nothing heard for {quiet_s:.1} s")],
-            ),
+            _ if blind => {
+                let gone = if self.alive {
+                    ""
+                } else {
+                    "the car's node or its link has gone; "
+                };
+                (
+                    "BLIND".to_owned(),
+                    vec![format!("{gone}nothing heard for {quiet_s:.1} s")],
+                )
+            }
             None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
             Some(health) => (
                 health.state.to_string(),

@@ -132,8 +132,10 @@ impl<T> CatchUp<T> {
     pub(crate) fn overdue(&mut self, now: i64) -> Vec<T> {
         let mut out = Vec::new();
         for stream in self.cars.values_mut().flat_map(|car| car.streams.values_mut()) {
+            // What began before it is known where the stream begins would seem to be its begin.
+            let hold = if stream.begun { HOLD } else { 3 * HOLD };
             while let Some(oldest) = stream.held.first_entry()
-                && now - oldest.get().0 > HOLD
+                && now - oldest.get().0 > hold
             {
                 out.push(oldest.remove().1);
             }

@@ -17,7 +17,7 @@ use crate::particles::{Belief, Particles};
 use crate::quality::Quality;
 use crate::recovery::Doubt;
 use crate::refine::{Estimate, fit, refine, wall_offset};
-use crate::search::{Search, fit_of};
+use crate::search::{INDEPENDENT, Search, fit_of};
 use crate::slip::{Slip, SlipWindow};
 use crate::slip_model::SlipModel;
 use crate::surprise::Surprise;
@@ -144,6 +144,13 @@ pub struct Hypothesis {
     pub pose: Pose,
     /// Log-likelihood of the last scans there, less than or equal to 0.
     pub score: f64,
+}
+
+impl Hypothesis {
+    /// How well the end points of the last scans lie on walls there, in `[0, 1]`.
+    pub fn fit(&self) -> f64 {
+        (self.score / INDEPENDENT).exp()
+    }
 }
 
 /// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.

@@ -93,7 +93,7 @@ const BEAMS: usize = 60;
 const FITTED_BEAMS: usize = 180;
 
 /// Neighbouring beams err together: the score counts this many as independent.
-const INDEPENDENT: f64 = 20.0;
+pub(crate) const INDEPENDENT: f64 = 20.0;
 
 impl Search {
     /// Takes in the next scan, and the motion and noise since the one before. Returns the confirmed estimate.

@@ -13,7 +13,7 @@ use serde::Deserialize;
 
 use super::steer::{give, reply, tell};
 use super::{FIND, no_such_car, open};
-use crate::cli::{Expect, LinkOptions, ParamsVerb};
+use crate::cli::{LinkOptions, ParamsVerb};
 use crate::output;
 
 /// Exit code: the car does not do that.
@@ -36,7 +36,15 @@ pub(super) async fn run(
         Some(ParamsVerb::Shadow { name: None }) => return shadow(link, car, json).await,
         Some(ParamsVerb::Shadow { name }) => {
             let name = name.filter(|name| name != "off");
-            (ParamsAction::Shadow { name }, Expect { expect: None })
+            let begun = name.clone();
+            let action = Action::Params(ParamsAction::Shadow { name });
+            let code = give(link, car, action, None, json).await?;
+            if let Some(name) = begun.filter(|_| code == ExitCode::SUCCESS && !json) {
+                output::say(&format!(
+                    "{name} runs in its shadow; `pitwall params {car} shadow` compares the two"
+                ));
+            }
+            return Ok(code);
         }
         Some(ParamsVerb::Select { name, change }) => {
             let revert_after_ms = change.revert_after.map(millis).transpose()?;

@@ -107,7 +107,7 @@ pub(super) async fn tell(
                 for c in candidates {
                     let heading = c.pose.heading.to_degrees();
                     output::say(&format!(
-                        "candidate {}: ({:.2}, {:.2}) m, {heading:.1} deg, {:.0} % of the end points on walls",
+                        "candidate {}: ({:.2}, {:.2}) m, {heading:.1} deg, fits the scans to {:.0} %",
                         c.number,
                         c.pose.x,
                         c.pose.y,

@@ -135,13 +135,26 @@ impl Rates {
 }
 
 impl fmt::Display for Rates {
-    /// `pose 20 Hz, cloud 10 Hz, scan 10 Hz, health 10 Hz, full-rate streams on`
+    /// `every pose, cloud 10 Hz, no scan, health 10 Hz, full-rate streams on`
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let recorded = if self.recorded { "on" } else { "off" };
+        for (what, rate) in [
+            ("pose", self.pose),
+            ("cloud", self.cloud),
+            ("scan", self.scan),
+            ("health", self.health),
+        ] {
+            if rate <= 0.0 {
+                write!(f, "no {what}, ")?;
+            } else if rate >= Self::MAX {
+                write!(f, "every {what}, ")?;
+            } else {
+                write!(f, "{what} {rate} Hz, ")?;
+            }
+        }
         write!(
             f,
-            "pose {} Hz, cloud {} Hz, scan {} Hz, health {} Hz, full-rate streams {recorded}",
-            self.pose, self.cloud, self.scan, self.health
+            "full-rate streams {}",
+            if self.recorded { "on" } else { "off" }
         )
     }
 }

@@ -231,7 +231,7 @@ const HALF_AROUND: [(i64, i64); 4] = [(1, 0), (1, 1), (0, 1), (-1, 1)];
 /// How solid each cell is, 0 to 255; None where the map does not say. The grey of a cell counts where it lies on a wall's
 /// face: an unknown cell between a free and an occupied one, or an occupied one beside a darker. Other occupied cells are
 /// solid, however pale the map is. On a map that marks no walls at all the unknown is solid.
-fn solidity(grid: &OccupancyGrid) -> Vec<Option<u8>> {
+pub fn solidity(grid: &OccupancyGrid) -> Vec<Option<u8>> {
     let unknown = (!grid.cells.contains(&Cell::Occupied)).then_some(u8::MAX);
     let solid = |i: usize| {
         let (column, row) = ((i % grid.width) as i64, (i / grid.width) as i64);

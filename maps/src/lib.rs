@@ -13,7 +13,7 @@ mod raceline_file;
 mod raster;
 mod ray_cast;
 
-pub use distance_field::{DistanceField, Sample};
+pub use distance_field::{DistanceField, Sample, solidity};
 pub use error::MapError;
 pub use grid::{Cell, OccupancyGrid};
 pub use map_file::{MapMetadata, MapMode};

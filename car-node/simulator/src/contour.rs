@@ -1,6 +1,6 @@
 //! Walls from a map's cells.
 
-use maps::{Cell, OccupancyGrid};
+use maps::{OccupancyGrid, solidity};
 
 use crate::{Surface, Wall};
 
@@ -10,14 +10,10 @@ use crate::{Surface, Wall};
 /// Each wall is one segment: rays and outlines need no more order.
 pub(crate) fn contours(grid: &OccupancyGrid) -> Vec<Wall> {
     let (width, height) = (grid.width as i64, grid.height as i64);
-    let free: Vec<f64> = grid
-        .cells
-        .iter()
-        .zip(&grid.occupancy)
-        .map(|(&cell, &occupancy)| match cell {
-            Cell::Unknown => 0.0,
-            Cell::Free | Cell::Occupied => 1.0 - f64::from(occupancy) / 255.0,
-        })
+    // Nobody drives where the map does not say, so a wall closes it off.
+    let free: Vec<f64> = solidity(grid)
+        .into_iter()
+        .map(|solid| solid.map_or(0.0, |solid| 1.0 - f64::from(solid) / 255.0))
         .collect();
     let at = |values: &[f64], column: i64, row: i64| {
         let inside = (0..width).contains(&column) && (0..height).contains(&row);

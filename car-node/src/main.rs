@@ -19,14 +19,14 @@ fn main() -> ExitCode {
         .with_writer(std::io::stderr)
         .init();
     let result = match Cli::parse().command {
-        Command::Run(arguments) => commands::run::run(&arguments),
-        Command::Evaluate(arguments) => commands::evaluate::run(&arguments),
-        Command::Ablate(arguments) => commands::ablate::run(&arguments),
+        Command::Run(arguments) => commands::run::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::Evaluate(arguments) => commands::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::Ablate(arguments) => commands::ablate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Race(arguments) => commands::race::run(&arguments),
-        Command::Track(arguments) => commands::track::run(&arguments.command),
+        Command::Track(arguments) => commands::track::run(&arguments.command).map(|()| ExitCode::SUCCESS),
     };
     match result {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(code) => code,
         Err(error) => {
             tracing::debug!(?error);
             commands::complain(&error);

@@ -124,6 +124,11 @@ const LEG: Duration = Duration::from_millis(900);
 const MOST_TRIM: f64 = 0.05;
 /// Further off the line [m] the servo is not what is wrong.
 const NEAR: f64 = 0.1;
+/// Slowed down behind a car ahead so hard [m/s^2]: what taped tyres have left in a bend.
+const BRAKE_BEHIND: f64 = 2.0;
+/// More room is left to a car that stands [m], none more to one that moves so fast [m/s].
+const BACKING_UP: f64 = 0.8;
+const SPEED_OF_TRAFFIC: f64 = 2.0;
 /// Not moving for this long is being stuck.
 const STUCK: Duration = Duration::from_millis(1500);
 
@@ -242,10 +247,18 @@ impl Driver {
         let error = (d.abs() - 0.1).max(0.0) + (off_heading.abs() - 0.2).max(0.0);
         let wanted = there * (1.0 - p.error_slowdown * error).clamp(0.3, 1.0);
         let wanted = wanted.min(speed.max(0.0) + p.traction);
-        match ahead {
-            Some(ahead) => wanted.min((ahead.speed + 1.5 * (ahead.gap - p.gap)).max(0.0)),
-            None => wanted,
-        }
+        ahead.map_or(wanted, |ahead| wanted.min(self.behind(ahead)))
+    }
+
+    /// Speed at which a car ahead is not run into [m/s].
+    fn behind(&self, ahead: Ahead) -> f64 {
+        let speed = ahead.speed.max(0.0);
+        // Who stands there may have to back up.
+        let gap = self.params.gap + BACKING_UP * (1.0 - speed / SPEED_OF_TRAFFIC).max(0.0);
+        let room = ahead.gap - gap;
+        let close = speed + 1.5 * room;
+        let far = (speed * speed + 2.0 * BRAKE_BEHIND * room.max(0.0)).sqrt();
+        close.min(far).max(0.0)
     }
 
     /// Direction in which the rear axle moves, seen from a car that drives along the line at `s` [rad]. From the line and

@@ -108,6 +108,11 @@ pub struct OdometrySensor {
 }
 
 impl OdometrySensor {
+    /// The gyroscope's latest reading [rad/s].
+    pub fn turning(&self) -> f64 {
+        self.latest_gyro
+    }
+
     /// Odometry that starts at the origin of `odom`.
     pub fn new(params: OdometryParams, wheelbase: f64, start: Duration, mut rng: StdRng) -> Self {
         let draw: f64 = StandardNormal.sample(&mut rng);

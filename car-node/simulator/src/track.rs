@@ -9,6 +9,15 @@ use maps::{MapError, OccupancyGrid, Raceline};
 use crate::generator::slowed_to;
 use crate::{SpeedParams, Walls};
 
+/// What our car is asked for on a line that was made for another one, whose bends may begin at once: a little less than on
+/// a line of its own. At that, it spins on taped tyres, even when it knows its true pose.
+const FOREIGN: SpeedParams = SpeedParams {
+    lateral: 4.4,
+    drive: 3.7,
+    brake: 3.5,
+    top: 7.6,
+};
+
 /// A track to race on.
 #[derive(Debug, Clone)]
 pub struct Track {
@@ -27,7 +36,7 @@ impl Track {
     /// names another file for the line, in any format that [`Raceline::parse`] reads.
     ///
     /// Without `walls.csv`, as for the map of a real track, the walls are taken from the map, and the raceline, which was
-    /// made for another car, is slowed to what ours can do ([`SpeedParams::default`]).
+    /// made for another car, is slowed to what ours can do.
     pub fn load(path: impl AsRef<Path>, raceline: Option<&Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
         let (folder, map) = if path.is_dir() {
@@ -46,7 +55,7 @@ impl Track {
                 Err(source) => return Err(MapError::Read { file, source }),
             }
         } else {
-            line = slowed_to(&line, &SpeedParams::default());
+            line = slowed_to(&line, &FOREIGN);
             Walls::from_grid(&grid)
         };
         let name = folder

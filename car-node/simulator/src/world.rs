@@ -11,7 +11,7 @@ use crate::driver::Ahead;
 use crate::vehicle::outline;
 use crate::{
     Controls, Driver, DriverParams, Estimate, Grip, Gyro, Lidar, LidarParams, Manoeuvre, Motion, Obstacle,
-    Odometry, OdometryParams, OdometrySensor, Scan, Track, Vehicle, VehicleParams,
+    Odometry, OdometryParams, OdometrySensor, Scan, Track, Vehicle, VehicleParams, YawSource,
 };
 
 /// Length of a tick: divides every sensor's period.
@@ -25,6 +25,9 @@ const CRASH_SPEED: f64 = 1.0;
 
 /// A wall or a car that was not touched for this long is touched anew; until then it is the same contact.
 const CONTACT: Duration = Duration::from_millis(500);
+
+/// Cars ahead that are nearer than this matter [m]: from full speed to rest behind one that stands.
+const IN_VIEW: f64 = 16.0;
 
 /// How long the marshals take to put a crashed car back.
 const MARSHALS: Duration = Duration::from_secs(3);
@@ -314,7 +317,7 @@ impl World {
                 gap: line.advance(own.track.s, other.track.s) - own.vehicle.params().body[0],
                 speed: other.vehicle.state().vx,
             })
-            .filter(|ahead| (-0.5..6.0).contains(&ahead.gap))
+            .filter(|ahead| (-0.5..IN_VIEW).contains(&ahead.gap))
             .min_by(|a, b| a.gap.total_cmp(&b.gap))
     }
 
@@ -491,7 +494,19 @@ impl Car {
                     yaw_rate,
                 });
             }
-            let controls = self.driver.drive(now, self.estimate.as_ref(), ahead, line);
+            // An odometry that knows its turning from the steering alone would have the driver answer his own steering: he
+            // reads the gyroscope himself.
+            let blind = self.guidance == Guidance::Estimate
+                && self.odometry.params().yaw_source == YawSource::Steering;
+            let estimate = self.estimate.map(|estimate| Estimate {
+                yaw_rate: if blind {
+                    self.odometry.turning()
+                } else {
+                    estimate.yaw_rate
+                },
+                ..estimate
+            });
+            let controls = self.driver.drive(now, estimate.as_ref(), ahead, line);
             self.pending.push((now + params.delay, controls));
         }
         let due = self.pending.partition_point(|&(at, _)| at <= now);
@@ -605,6 +620,53 @@ mod tests {
             })
             .collect();
         World::new(ring(), &setups, 3)
+    }
+
+    #[test]
+    fn traffic_goes_on_when_a_car_slips_and_another_is_knocked_round() {
+        // As in the demo: the second car on taped tyres, the third behind a slower opponent; the first on dust for a while,
+        // the third knocked round twice. All know their true pose: what they touch is the driving's fault.
+        let setup = |start: f64, speed_scale: f64| {
+            let setup = CarSetup::default();
+            CarSetup {
+                start,
+                guidance: Guidance::Truth,
+                driver: DriverParams {
+                    speed_scale,
+                    ..setup.driver
+                },
+                ..setup
+            }
+        };
+        let mut setups = [(-4.0, 1.0), (-8.0, 1.0), (-16.0, 1.0), (-12.0, 0.97)].map(|(s, v)| setup(s, v));
+        setups[1].vehicle = setups[1].vehicle.with_grip(Grip::LQ);
+        let mut world = World::new(ring(), &setups, 0);
+        let mut laps = [0; 4];
+        let events = [
+            (20, 0, Some(Grip::LQ)),
+            (40, 0, Some(Grip::HQ)),
+            (50, 2, None),
+            (75, 2, None),
+        ];
+        let mut events = events.into_iter().peekable();
+        while world.now() < Duration::from_secs(110) {
+            while let Some((_, car, grip)) =
+                events.next_if(|(at, ..)| world.now() >= Duration::from_secs(*at))
+            {
+                match grip {
+                    Some(grip) => world.set_grip(car, grip),
+                    None => world.knock(car, 9.0),
+                }
+            }
+            for output in world.step() {
+                match output.message {
+                    Message::Crash(_) | Message::Collision(_) => panic!("{:?}: {output:?}", world.now()),
+                    Message::Lap(lap) => laps[output.car] = lap.number,
+                    _ => {}
+                }
+            }
+        }
+        assert!(laps.iter().all(|laps| *laps >= 10), "{laps:?}");
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! `car-node race`.
 
+use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -28,7 +29,10 @@ struct Report {
     races: Vec<Vec<CarResult>>,
 }
 
-pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
+/// A car crashed or did not finish: neither a fault of the call (2) nor of the files (1).
+const UNFINISHED: u8 = 3;
+
+pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
     let track = Arc::new(find_track(&arguments.track, arguments.raceline.as_deref())?);
     for fault in TrackReport::of(&track).faults {
         eprintln!("car-node: warning: {}: {fault}", arguments.track);
@@ -36,7 +40,8 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
     let map = TrackMap::new(track.grid.clone()).with_context(|| arguments.track.clone())?;
     let map = Arc::new(map);
     if arguments.table {
-        return table(arguments, &track, &map);
+        // Its rows are there to be compared, and some are there to crash.
+        return table(arguments, &track, &map).map(|()| ExitCode::SUCCESS);
     }
     let (localizer, guide) = chosen(arguments)?;
     let quality = match arguments.odometry {
@@ -49,7 +54,13 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<()> {
     } else {
         print_one(&report);
     }
-    Ok(())
+    let summary = &report.summary;
+    let clean = summary.finished == summary.started && summary.crashes == 0;
+    Ok(if clean {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::from(UNFINISHED)
+    })
 }
 
 /// What the arguments ask for, and what to call it.

@@ -406,6 +406,7 @@ mod tests {
     use super::*;
     use crate::health::State;
     use crate::source::Incident;
+    use simulator::YawSource;
 
     fn club() -> (Arc<Track>, Arc<TrackMap>) {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../maps/tracks/club");
@@ -471,6 +472,33 @@ mod tests {
         );
         let summary = RaceSummary::of(&results);
         assert_eq!(summary.states, car.states);
+    }
+
+    #[test]
+    fn a_car_that_slips_and_knows_its_turning_from_the_steering_alone_races_on() {
+        // In the demo it span in every lap, and all cars queued behind it: its driver took what he had commanded for
+        // what the car did.
+        let (track, map) = club();
+        let setup = RaceSetup {
+            quality: Quality::Lq,
+            ..setup(
+                Guide::SynPf(Box::new(Parameters::named("hq").expect("ships"))),
+                3,
+                1,
+            )
+        };
+        let mut cars = field(&setup);
+        cars[0].odometry.yaw_source = YawSource::Steering;
+        let end = End {
+            laps: Some(3),
+            time: Duration::from_secs(40),
+        };
+        let results = run(&track, &map, &cars, Vec::new(), &setup.guide, end, 1).expect("a race");
+        assert!(
+            results[0].finished && results[0].mishaps.is_empty(),
+            "{:?}",
+            results[0]
+        );
     }
 
     #[test]

@@ -463,13 +463,15 @@ mod tests {
     fn keeps_away_from_a_car_ahead() {
         let line = circle();
         let estimate = at(Pose::new(4.0, 0.0, PI / 2.0), 3.0);
-        let speed = |gap| {
-            let ahead = Ahead { gap, speed: 1.0 };
+        let speed = |gap, speed| {
+            let ahead = Ahead { gap, speed };
             driver()
                 .drive(Duration::ZERO, Some(&estimate), Some(ahead), &line)
                 .speed
         };
-        assert!(speed(0.2) < 1.0 && speed(1.0) > 1.0 && speed(9.0) > 2.5);
+        assert!(speed(0.2, 2.0) < 2.0 && speed(1.0, 2.0) > 2.0 && speed(9.0, 2.0) > 2.5);
+        // One that stands may have to back up.
+        assert!(speed(1.5, 0.0) <= 0.0 && speed(1.7, 0.0) > 0.0);
     }
 
     #[test]

@@ -73,7 +73,10 @@ class Radio(threading.Thread):
             readable, _, _ = select.select(self.ends, [], [], min(wait, 0.1))
             now = time.monotonic()
             for end in readable:
-                packet = os.read(end, 4096)
+                try:
+                    packet = os.read(end, 4096)
+                except OSError:
+                    return  # Its namespace is gone, and the check is over.
                 side = self.ends.index(end)
                 began = max(now, free[side])
                 if self.out or dice.random() < self.loss or began - now > QUEUE:

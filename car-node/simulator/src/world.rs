@@ -602,22 +602,25 @@ mod tests {
         Arc::new(Track::bundled("club").expect("it ships"))
     }
 
+    /// A car that starts there, drives at so much of the line's speed, and knows its true pose.
+    fn setup(start: f64, speed_scale: f64) -> CarSetup {
+        let setup = CarSetup::default();
+        CarSetup {
+            start,
+            guidance: Guidance::Truth,
+            driver: DriverParams {
+                speed_scale,
+                ..setup.driver
+            },
+            ..setup
+        }
+    }
+
     fn cars(starts: &[f64], speed_scales: &[f64]) -> World {
         let setups: Vec<CarSetup> = starts
             .iter()
             .zip(speed_scales)
-            .map(|(&start, &speed_scale)| {
-                let setup = CarSetup::default();
-                CarSetup {
-                    start,
-                    guidance: Guidance::Truth,
-                    driver: DriverParams {
-                        speed_scale,
-                        ..setup.driver
-                    },
-                    ..setup
-                }
-            })
+            .map(|(&start, &speed_scale)| setup(start, speed_scale))
             .collect();
         World::new(ring(), &setups, 3)
     }
@@ -626,18 +629,6 @@ mod tests {
     fn traffic_goes_on_when_a_car_slips_and_another_is_knocked_round() {
         // As in the demo: the second car on taped tyres, the third behind a slower opponent; the first on dust for a while,
         // the third knocked round twice. All know their true pose: what they touch is the driving's fault.
-        let setup = |start: f64, speed_scale: f64| {
-            let setup = CarSetup::default();
-            CarSetup {
-                start,
-                guidance: Guidance::Truth,
-                driver: DriverParams {
-                    speed_scale,
-                    ..setup.driver
-                },
-                ..setup
-            }
-        };
         let mut setups = [(-4.0, 1.0), (-8.0, 1.0), (-16.0, 1.0), (-12.0, 0.97)].map(|(s, v)| setup(s, v));
         setups[1].vehicle = setups[1].vehicle.with_grip(Grip::LQ);
         let mut world = World::new(ring(), &setups, 0);

@@ -70,7 +70,6 @@ pub(crate) struct Search {
     /// Best first.
     pub(crate) candidates: Vec<Candidate>,
     driven: f64,
-    seconds: f64,
     since_seeding: f64,
 }
 
@@ -106,7 +105,6 @@ impl Search {
         parameters: &Parameters,
     ) -> Option<Estimate> {
         self.driven += motion.x.hypot(motion.y);
-        self.seconds += seconds;
         self.since_seeding += seconds;
         let forget = (seconds / MEMORY).clamp(0.01, 0.5);
         let noise = Matrix3::from_diagonal(&Vector3::new(

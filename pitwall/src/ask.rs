@@ -11,6 +11,7 @@ use protocol::{
 };
 use serde::Serialize;
 use tokio::sync::mpsc;
+use zenoh::Session;
 use zenoh::qos::Priority;
 use zenoh::query::ConsolidationMode;
 
@@ -168,7 +169,8 @@ impl Link {
         let mut presence = Box::pin(self.alive_after(Duration::ZERO, car));
         loop {
             let left = patience.saturating_sub(begun.elapsed());
-            self.pose(
+            pose(
+                &self.session,
                 car,
                 command.action.topic(),
                 bytes.clone(),
@@ -205,37 +207,6 @@ impl Link {
         }
     }
 
-    /// Poses a question of which every answer, within `patience`, goes to `answers`.
-    async fn pose(
-        &self,
-        car: &CarName,
-        topic: Topic,
-        question: Vec<u8>,
-        patience: Duration,
-        priority: Priority,
-        answers: &mpsc::UnboundedSender<Vec<u8>>,
-    ) {
-        let key = Key::new(car.clone(), topic).to_string();
-        let answers = answers.clone();
-        let sent = self
-            .session
-            .get(&key)
-            .payload(question)
-            .timeout(patience)
-            .consolidation(ConsolidationMode::None)
-            .congestion_control(ASK_CONGESTION)
-            .priority(priority)
-            .callback(move |reply| match reply.into_result() {
-                // Nobody waits any more after the first.
-                Ok(sample) => drop(answers.send(sample.payload().to_bytes().into_owned())),
-                Err(error) => tracing::debug!(?error, "an error in place of a reply"),
-            })
-            .await;
-        if let Err(error) = sent {
-            tracing::debug!(%key, %error, "the question could not be sent");
-        }
-    }
-
     /// The same, asked after a pause.
     async fn alive_after(&self, pause: Duration, car: &CarName) -> bool {
         tokio::time::sleep(pause).await;
@@ -262,9 +233,15 @@ impl Link {
 
     /// Fetches the car's map and hands it on as an event. None when the car does not answer.
     pub async fn fetch_map(&self, car: &CarName) -> Option<()> {
-        let bytes = self
-            .ask_bytes(car, Topic::Map, Vec::new(), MAP_PATIENCE, Priority::Background)
-            .await?;
+        let bytes = first_answer(
+            &self.session,
+            car,
+            Topic::Map,
+            Vec::new(),
+            MAP_PATIENCE,
+            Priority::Background,
+        )
+        .await?;
         match decode::<MapReply>(&bytes) {
             Ok((_, map)) => self.hand_on(
                 car,
@@ -331,32 +308,63 @@ impl Link {
         question: Vec<u8>,
         patience: Duration,
     ) -> Result<Option<M>, String> {
-        match self.ask_bytes(car, topic, question, patience, ASK_PRIORITY).await {
+        match first_answer(&self.session, car, topic, question, patience, ASK_PRIORITY).await {
             Some(bytes) => decode::<M>(&bytes)
                 .map(|(_, message)| Some(message))
                 .map_err(|e| e.to_string()),
             None => Ok(None),
         }
     }
+}
 
-    async fn ask_bytes(
-        &self,
-        car: &CarName,
-        topic: Topic,
-        question: Vec<u8>,
-        patience: Duration,
-        priority: Priority,
-    ) -> Option<Vec<u8>> {
-        let (answers, mut answered) = mpsc::unbounded_channel();
-        self.pose(car, topic, question, patience, priority, &answers)
-            .await;
-        // With the last sender, which the question holds until it is answered or given up, the wait ends.
-        drop(answers);
-        answered.recv().await
+/// Poses a question of which every answer, within `patience`, goes to `answers`.
+async fn pose(
+    session: &Session,
+    car: &CarName,
+    topic: Topic,
+    question: Vec<u8>,
+    patience: Duration,
+    priority: Priority,
+    answers: &mpsc::UnboundedSender<Vec<u8>>,
+) {
+    let key = Key::new(car.clone(), topic).to_string();
+    let answers = answers.clone();
+    let sent = session
+        .get(&key)
+        .payload(question)
+        .timeout(patience)
+        .consolidation(ConsolidationMode::None)
+        .congestion_control(ASK_CONGESTION)
+        .priority(priority)
+        .callback(move |reply| match reply.into_result() {
+            // Nobody waits any more after the first.
+            Ok(sample) => drop(answers.send(sample.payload().to_bytes().into_owned())),
+            Err(error) => tracing::debug!(?error, "an error in place of a reply"),
+        })
+        .await;
+    if let Err(error) = sent {
+        tracing::debug!(%key, %error, "the question could not be sent");
     }
 }
 
-fn stamps() -> Stamps {
+/// The first answer to a question; None when there is none within `patience`. Answers come with the question's priority.
+pub(crate) async fn first_answer(
+    session: &Session,
+    car: &CarName,
+    topic: Topic,
+    question: Vec<u8>,
+    patience: Duration,
+    priority: Priority,
+) -> Option<Vec<u8>> {
+    let (answers, mut answered) = mpsc::unbounded_channel();
+    pose(session, car, topic, question, patience, priority, &answers).await;
+    // With the last sender, which the question holds until it is answered or given up, the wait ends.
+    drop(answers);
+    answered.recv().await
+}
+
+/// Stamps of a question or a command: only when it was sent is of interest.
+pub(crate) fn stamps() -> Stamps {
     Stamps {
         published: unix_now(),
         ..Stamps::default()

@@ -10,15 +10,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossbeam_channel::{Receiver, Sender, select};
-use protocol::{CarName, Header, Key, MissingReply, Resent, Stamps, Telemetry, Topic, decode, encode};
+use protocol::{CarName, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
-use zenoh::query::ConsolidationMode;
 use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Config, Session};
 
+use crate::ask::{first_answer, stamps};
 use crate::catch_up::{CatchUp, Place, Question};
 use crate::event::{FleetEvent, Happening, Lane};
 
@@ -466,33 +466,19 @@ async fn ask_all(
 
 /// Asks a car for what is missing. None without an answer in time.
 async fn ask_for_missing(session: &Session, question: Question) -> Option<(u64, MissingReply)> {
-    let key = Key::new(question.car, Topic::Missing).to_string();
-    let stamps = Stamps {
-        published: unix_now(),
-        ..Stamps::default()
-    };
-    // The answer comes with the question's priority: ahead of what can wait, behind what an operator waits for.
+    // Ahead of what can wait, behind what an operator waits for.
     let priority = if question.urgent {
         Priority::DataHigh
     } else {
         Priority::Data
     };
-    let replies = session
-        .get(&key)
-        .payload(encode(&question.request, stamps).ok()?)
-        .timeout(MISSING_PATIENCE)
-        .consolidation(ConsolidationMode::None)
-        .congestion_control(ASK_CONGESTION)
-        .priority(priority)
-        .await
-        .inspect_err(|error| tracing::debug!(%key, %error, "the question could not be sent"))
-        .ok()?;
-    let reply = replies.recv_async().await.ok()?;
-    let bytes = reply.result().ok()?.payload().to_bytes();
+    let (car, topic) = (&question.car, Topic::Missing);
+    let request = encode(&question.request, stamps()).ok()?;
+    let bytes = first_answer(session, car, topic, request, MISSING_PATIENCE, priority).await?;
     match decode::<MissingReply>(&bytes) {
         Ok((header, reply)) => Some((header.session, reply)),
         Err(error) => {
-            tracing::debug!(%key, %error, "an answer that cannot be read");
+            tracing::debug!(%car, %error, "an answer that cannot be read");
             None
         }
     }

@@ -6,13 +6,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use car_node::archive::Archive;
 use pitwall::unix_now;
 use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
-    Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Kept, Key, Latency, Load,
-    MapRaceline, MapReply, Message, Metrics, MissingReply, MissingRequest, Outcome, ParameterSet, Params,
-    ParamsAction, Pose, Pose2, PoseKind, RecordedOdometry, RelocalizeAction, Reply, Resent, ScanView, SetRef,
-    Stamps, State, Topic, TrackPoint, Twist2, Value, decode, encode,
+    Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Key, Latency, Load,
+    MapRaceline, MapReply, Message, Metrics, MissingRequest, Outcome, ParameterSet, Params, ParamsAction,
+    Pose, Pose2, PoseKind, RecordedOdometry, RelocalizeAction, Reply, ScanView, SetRef, Stamps, State, Topic,
+    TrackPoint, Twist2, Value, decode, encode,
 };
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
@@ -40,8 +41,8 @@ pub struct FakeCar {
 /// What it has sent, and the set in force.
 struct CarState {
     published: BTreeMap<Topic, u64>,
-    /// All messages of the streams that must be whole.
-    sent: BTreeMap<Topic, Vec<Vec<u8>>>,
+    /// The messages of the streams that must be whole.
+    archive: Archive,
     set: SetRef,
     who: String,
     session: u64,
@@ -80,7 +81,7 @@ impl FakeCar {
         let session = zenoh::open(config(endpoint)).await.expect("a session");
         let state = Arc::new(Mutex::new(CarState {
             published: BTreeMap::new(),
-            sent: BTreeMap::new(),
+            archive: Archive::default(),
             set: SetRef {
                 name: "hq".into(),
                 revision: 1,
@@ -186,7 +187,7 @@ impl Topics {
         let bytes = encode(message, stamps).expect("a good message");
         if topic.recovered() {
             let mut state = state.lock().expect("no panic");
-            state.sent.entry(topic).or_default().push(bytes.clone());
+            state.archive.keep(topic, stamps.sequence, bytes.clone());
         }
         let key = Key::new(self.name.clone(), topic).to_string();
         self.session.put(key, bytes).await.expect("sent");
@@ -469,7 +470,9 @@ async fn answer_questions(
             let Ok((_, request)) = decode::<MissingRequest>(&payload) else {
                 return;
             };
-            let (session, reply) = send_again(&sent.lock().expect("no panic"), &request);
+            let state = sent.lock().expect("no panic");
+            let (session, reply) = (state.session, state.archive.find(state.session, &request));
+            drop(state);
             let stamps = Stamps {
                 session,
                 ..Stamps::default()
@@ -482,35 +485,6 @@ async fn answer_questions(
     for topic in [Topic::CmdParams, Topic::CmdPose, Topic::CmdRelocalize] {
         obey_on(session, key(topic), state.clone(), behaviour).await;
     }
-}
-
-/// What is missing, as much of it as is asked for at once.
-fn send_again(state: &CarState, request: &MissingRequest) -> (u64, MissingReply) {
-    let kept = state.sent.iter().map(|(&topic, sent)| Kept {
-        topic,
-        first: 1,
-        last: sent.len() as u64,
-    });
-    let mut messages = Vec::new();
-    let mut room = request.budget as usize;
-    for wanted in &request.streams {
-        let sent = state.sent.get(&wanted.topic).into_iter().flatten();
-        for (bytes, number) in sent.zip(1..) {
-            let missing = wanted
-                .ranges
-                .iter()
-                .any(|[from, to]| (*from..=*to).contains(&number));
-            if missing && bytes.len() <= room {
-                room -= bytes.len();
-                messages.push(Resent {
-                    topic: wanted.topic,
-                    bytes: bytes.clone(),
-                });
-            }
-        }
-    }
-    let streams = kept.collect();
-    (state.session, MissingReply { streams, messages })
 }
 
 async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>>, behaviour: Behaviour) {

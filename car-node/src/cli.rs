@@ -148,15 +148,26 @@ pub(crate) struct TopicArguments {
     pub(crate) laser: Option<Pose>,
 }
 
-/// Arguments of `evaluate`.
+/// Bags, and the map that they were driven on.
 #[derive(Debug, Args)]
-pub(crate) struct Evaluate {
+pub(crate) struct Bags {
     /// Map: a map_server YAML file.
     #[arg(long, value_name = "MAP.yaml")]
     pub(crate) map: PathBuf,
     /// ROS 2 bag (MCAP); may be repeated.
-    #[arg(long, value_name = "FILE.mcap", required = true, num_args = 1..)]
-    pub(crate) bag: Vec<PathBuf>,
+    #[arg(long = "bag", value_name = "FILE.mcap", required = true, num_args = 1..)]
+    pub(crate) files: Vec<PathBuf>,
+    /// Which topics of the bags to take.
+    #[command(flatten)]
+    pub(crate) topics: TopicArguments,
+}
+
+/// Arguments of `evaluate`.
+#[derive(Debug, Args)]
+pub(crate) struct Evaluate {
+    /// What to run over.
+    #[command(flatten)]
+    pub(crate) bags: Bags,
     /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     pub(crate) params: String,
@@ -171,9 +182,6 @@ pub(crate) struct Evaluate {
     /// black-tubes; may be repeated.
     #[arg(long, value_name = "KIND@S+S")]
     pub(crate) fault: Vec<Fault>,
-    /// Which topics of the bags to take.
-    #[command(flatten)]
-    pub(crate) topics: TopicArguments,
     /// Write `stamp_s,x_m,y_m,heading_rad` of base_link at every update to this CSV file (one bag, one seed).
     #[arg(long, value_name = "OUT.csv")]
     pub(crate) poses: Option<PathBuf>,
@@ -185,12 +193,9 @@ pub(crate) struct Evaluate {
 /// Arguments of `ablate`.
 #[derive(Debug, Args)]
 pub(crate) struct Ablate {
-    /// Map: a map_server YAML file.
-    #[arg(long, value_name = "MAP.yaml")]
-    pub(crate) map: PathBuf,
-    /// ROS 2 bag (MCAP); may be repeated.
-    #[arg(long, value_name = "FILE.mcap", required = true, num_args = 1..)]
-    pub(crate) bag: Vec<PathBuf>,
+    /// What to run over.
+    #[command(flatten)]
+    pub(crate) bags: Bags,
     /// The set to arrive at: hq, lq, adaptive, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     pub(crate) params: String,
@@ -201,9 +206,6 @@ pub(crate) struct Ablate {
     /// Seeds to take the mean over, as a list: 0,1,2.
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0,1,2")]
     pub(crate) seed: Vec<u64>,
-    /// Which topics of the bags to take.
-    #[command(flatten)]
-    pub(crate) topics: TopicArguments,
     /// A JSON array of rows on stdout.
     #[arg(long)]
     pub(crate) json: bool,

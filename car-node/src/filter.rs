@@ -564,9 +564,9 @@ impl Loop {
         let verdict = self.filter.monitor.verdict().clone();
         if changed {
             self.event(EventKind::StateChanged {
-                from: wire::state(self.last_state),
-                to: wire::state(state),
-                causes: verdict.causes.iter().map(wire::cause).collect(),
+                from: self.last_state,
+                to: state,
+                causes: verdict.causes.clone(),
             });
             self.last_state = state;
         }

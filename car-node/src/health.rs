@@ -17,7 +17,6 @@
 //! Pure: it reads no clock. Times are stamps of the sensors' clock, given by the caller. What is good, bad or
 //! lost is in [`Thresholds`].
 
-mod cause;
 mod fit;
 mod metrics;
 mod monitor;
@@ -25,9 +24,10 @@ mod rules;
 mod slip;
 mod thresholds;
 
-pub use cause::{Cause, CauseKind, Severity};
 pub use metrics::Metrics;
-pub use monitor::{Monitor, State, Verdict};
+pub use monitor::{Monitor, Verdict};
+// A state and its causes are what is told: the words for them are the same on the car as at the wall.
+pub use protocol::{Cause, CauseKind, Severity, State};
 pub use slip::{SlipEvent, SlipTracker};
 pub use thresholds::Thresholds;
 

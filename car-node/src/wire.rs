@@ -10,7 +10,7 @@ use synpf::{Hypothesis, Odometry, Scan, Twist};
 
 use crate::clock::SensorClock;
 use crate::counters::Spread;
-use crate::health::{Cause, CauseKind, Metrics, Severity, State};
+use crate::health::Metrics;
 use crate::outbox::{CloudSample, Fit, HealthReport, PoseEstimate, ScanPoints, TrueMotion};
 
 /// What is not finite has no place on the wire; such a number becomes 0, having been counted as bad where it
@@ -124,55 +124,6 @@ pub fn scan_view(points: &ScanPoints) -> ScanView {
     }
 }
 
-/// A health state.
-pub fn state(state: State) -> protocol::State {
-    match state {
-        State::Init => protocol::State::Init,
-        State::Converging => protocol::State::Converging,
-        State::Localized => protocol::State::Localized,
-        State::Degraded => protocol::State::Degraded,
-        State::Lost => protocol::State::Lost,
-        State::Relocalizing => protocol::State::Relocalizing,
-        State::Stale => protocol::State::Stale,
-    }
-}
-
-/// A cause.
-pub fn cause(cause: &Cause) -> protocol::Cause {
-    use protocol::CauseKind as Wire;
-    protocol::Cause {
-        kind: match cause.kind {
-            CauseKind::NoInitialPose => Wire::NoInitialPose,
-            CauseKind::NewPose => Wire::NewPose,
-            CauseKind::Alignment => Wire::Alignment,
-            CauseKind::Residual => Wire::Residual,
-            CauseKind::LongBeams => Wire::LongBeams,
-            CauseKind::Occluded => Wire::Occluded,
-            CauseKind::NoReturn => Wire::NoReturn,
-            CauseKind::EffectiveSampleSize => Wire::EffectiveSampleSize,
-            CauseKind::Likelihood => Wire::Likelihood,
-            CauseKind::SpreadAlong => Wire::SpreadAlong,
-            CauseKind::SpreadAcross => Wire::SpreadAcross,
-            CauseKind::SecondMode => Wire::SecondMode,
-            CauseKind::Slip => Wire::Slip,
-            CauseKind::YawRate => Wire::YawRate,
-            CauseKind::Innovation => Wire::Innovation,
-            CauseKind::Age => Wire::Age,
-            CauseKind::NoScan => Wire::NoScan,
-            CauseKind::NoOdometry => Wire::NoOdometry,
-            CauseKind::BadSensorData => Wire::BadSensorData,
-            CauseKind::Searching => Wire::Searching,
-        },
-        severity: match cause.severity {
-            Severity::Info => protocol::Severity::Info,
-            Severity::Warning => protocol::Severity::Warning,
-            Severity::Critical => protocol::Severity::Critical,
-        },
-        value: cause.value.map(finite),
-        limit: cause.limit.map(finite),
-    }
-}
-
 fn metrics(metrics: &Metrics) -> protocol::Metrics {
     protocol::Metrics {
         alignment: share(metrics.alignment),
@@ -198,14 +149,14 @@ fn metrics(metrics: &Metrics) -> protocol::Metrics {
 /// A health report. Its times go from the sensors' clock to the wall's.
 pub fn health(report: &HealthReport, clock: &SensorClock) -> Health {
     Health {
-        state: state(report.verdict.state),
+        state: report.verdict.state,
         since: clock.wall(report.verdict.since).0,
         causes: report
             .verdict
             .causes
             .iter()
             .take(Health::MAX_CAUSES)
-            .map(cause)
+            .copied()
             .collect(),
         update: report.verdict.update,
         metrics: report.verdict.metrics.as_ref().map(metrics),

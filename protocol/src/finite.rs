@@ -46,28 +46,44 @@ impl Walker {
     }
 }
 
+/// Values that cannot be wrong.
 macro_rules! pass {
-    ($($method:ident($type:ty),)*) => {
-        $(fn $method(self, _: $type) -> Result<(), Found> { Ok(()) })*
+    ($($method:ident($($of:ty),*),)*) => {
+        $(fn $method(self, $(_: $of),*) -> Result<(), Found> { Ok(()) })*
+    };
+}
+
+/// Values that hold others.
+macro_rules! enter {
+    ($($method:ident($($of:ty),*) -> $compound:ident,)*) => {
+        $(
+            type $compound = Self;
+
+            fn $method(self, $(_: $of),*) -> Result<Self, Found> { Ok(self) }
+        )*
     };
 }
 
 impl ser::Serializer for &mut Walker {
     type Ok = ();
     type Error = Found;
-    type SerializeSeq = Self;
-    type SerializeTuple = Self;
-    type SerializeTupleStruct = Self;
-    type SerializeTupleVariant = Self;
-    type SerializeMap = Self;
-    type SerializeStruct = Self;
-    type SerializeStructVariant = Self;
 
     pass! {
         serialize_bool(bool), serialize_i8(i8), serialize_i16(i16), serialize_i32(i32), serialize_i64(i64),
         serialize_u8(u8), serialize_u16(u16), serialize_u32(u32), serialize_u64(u64), serialize_i128(i128),
         serialize_u128(u128), serialize_char(char), serialize_str(&str), serialize_bytes(&[u8]),
-        serialize_unit_struct(&'static str),
+        serialize_none(), serialize_unit(), serialize_unit_struct(&'static str),
+        serialize_unit_variant(&'static str, u32, &'static str),
+    }
+
+    enter! {
+        serialize_seq(Option<usize>) -> SerializeSeq,
+        serialize_tuple(usize) -> SerializeTuple,
+        serialize_tuple_struct(&'static str, usize) -> SerializeTupleStruct,
+        serialize_tuple_variant(&'static str, u32, &'static str, usize) -> SerializeTupleVariant,
+        serialize_map(Option<usize>) -> SerializeMap,
+        serialize_struct(&'static str, usize) -> SerializeStruct,
+        serialize_struct_variant(&'static str, u32, &'static str, usize) -> SerializeStructVariant,
     }
 
     fn serialize_f32(self, value: f32) -> Result<(), Found> {
@@ -78,20 +94,8 @@ impl ser::Serializer for &mut Walker {
         self.number(value)
     }
 
-    fn serialize_none(self) -> Result<(), Found> {
-        Ok(())
-    }
-
     fn serialize_some<T: Serialize + ?Sized>(self, value: &T) -> Result<(), Found> {
         value.serialize(self)
-    }
-
-    fn serialize_unit(self) -> Result<(), Found> {
-        Ok(())
-    }
-
-    fn serialize_unit_variant(self, _: &'static str, _: u32, _: &'static str) -> Result<(), Found> {
-        Ok(())
     }
 
     fn serialize_newtype_struct<T: Serialize + ?Sized>(
@@ -110,46 +114,6 @@ impl ser::Serializer for &mut Walker {
         value: &T,
     ) -> Result<(), Found> {
         value.serialize(self)
-    }
-
-    fn serialize_seq(self, _: Option<usize>) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_tuple(self, _: usize) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_tuple_struct(self, _: &'static str, _: usize) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_tuple_variant(
-        self,
-        _: &'static str,
-        _: u32,
-        _: &'static str,
-        _: usize,
-    ) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_map(self, _: Option<usize>) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_struct(self, _: &'static str, _: usize) -> Result<Self, Found> {
-        Ok(self)
-    }
-
-    fn serialize_struct_variant(
-        self,
-        _: &'static str,
-        _: u32,
-        _: &'static str,
-        _: usize,
-    ) -> Result<Self, Found> {
-        Ok(self)
     }
 
     fn is_human_readable(&self) -> bool {

@@ -9,7 +9,6 @@ use car_node::evaluate::ablation::{Change, Step, steps};
 use car_node::evaluate::{Outcome, Start, Summaries, Truth, mean, run as run_over};
 use car_node::frames::Mount;
 use indicatif::{ProgressBar, ProgressStyle};
-use maps::OccupancyGrid;
 use serde::Serialize;
 use synpf::{Localizer, SetUpError, TrackMap};
 
@@ -71,13 +70,8 @@ pub(crate) fn run(arguments: &Ablate) -> anyhow::Result<()> {
     let steps = steps(&set.parameters)
         .map_err(SetUpError::Parameters)
         .with_context(|| format!("{}: no way there from synpf-baseline", set.name))?;
-    let grid = OccupancyGrid::load(&arguments.map)?;
-    let logs = arguments
-        .bag
-        .iter()
-        .map(|bag| Ok((bag, super::read_bag(bag, &arguments.topics)?)))
-        .collect::<anyhow::Result<Vec<_>>>()?;
-    let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
+    let map = super::load_map(&arguments.bags.map)?;
+    let logs = super::read_bags(&arguments.bags)?;
 
     let progress = ProgressBar::new((logs.len() * steps.len() * arguments.seed.len()) as u64);
     if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len}") {

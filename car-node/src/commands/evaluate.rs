@@ -12,9 +12,8 @@ use car_node::evaluate::{
     ErrorSummary, Fault, FaultKind, FaultReport, Outcome, Start, Truth, run as run_over,
 };
 use indicatif::{ProgressBar, ProgressStyle};
-use maps::OccupancyGrid;
 use serde::Serialize;
-use synpf::{Localizer, TrackMap, Update};
+use synpf::{Localizer, Update};
 
 use crate::cli::Evaluate;
 
@@ -42,26 +41,20 @@ struct Report {
 }
 
 pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
-    if arguments.poses.is_some() && arguments.bag.len() * arguments.seed.len() > 1 {
+    if arguments.poses.is_some() && arguments.bags.files.len() * arguments.seed.len() > 1 {
         bail!("--poses takes the poses of one run: give one --bag and one --seed");
     }
     let mut faults = arguments.fault.clone();
     faults.sort_by(|a, b| a.at.total_cmp(&b.at));
     let set = super::load_set(&arguments.params)?;
-    let grid = OccupancyGrid::load(&arguments.map)?;
-    let logs = arguments
-        .bag
-        .iter()
-        .map(|bag| {
-            let mut log = super::read_bag(bag, &arguments.topics)?;
-            // The last first: cutting a piece out moves all that comes after it.
-            for fault in faults.iter().rev() {
-                fault.apply(&mut log);
-            }
-            Ok((bag, log))
-        })
-        .collect::<anyhow::Result<Vec<_>>>()?;
-    let map = Arc::new(TrackMap::new(grid).with_context(|| arguments.map.display().to_string())?);
+    let map = super::load_map(&arguments.bags.map)?;
+    let mut logs = super::read_bags(&arguments.bags)?;
+    for (_, log) in &mut logs {
+        // The last first: cutting a piece out moves all that comes after it.
+        for fault in faults.iter().rev() {
+            fault.apply(log);
+        }
+    }
     // Only the part of the map that the car can get to from its start, where that is known: a whole building takes
     // a minute and a gigabyte.
     let start = match arguments.initial_pose {
@@ -94,7 +87,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
             let outcome = over_bag(arguments, localizer, log, &truth, &progress)
                 .with_context(|| bag.display().to_string())?;
             reports.push(Report {
-                bag: (*bag).clone(),
+                bag: bag.into(),
                 params: set.name.clone(),
                 seed,
                 faults: fault_reports(&faults, &outcome),
@@ -254,11 +247,7 @@ fn print_one(report: &Report) {
         );
     }
     for (state, share) in &outcome.state_share {
-        say!(
-            "  {:<12} {:>8.1}%",
-            format!("{state:?}").to_uppercase(),
-            share * 100.0
-        );
+        say!("  {:<12} {:>8.1}%", state, share * 100.0);
     }
     if let Some(truth) = outcome.state_truth {
         let percent =

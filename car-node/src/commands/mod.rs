@@ -16,15 +16,18 @@ pub(crate) mod run;
 pub(crate) mod track;
 
 use std::io::{ErrorKind, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use car_node::bag::{Bag, SensorLog, Topics};
 use car_node::frames::Mount;
 use car_node::sets::{self, NamedSet};
+use maps::OccupancyGrid;
 use simulator::{BUNDLED, Track};
+use synpf::TrackMap;
 
-use crate::cli::TopicArguments;
+use crate::cli::{Bags, TopicArguments};
 
 /// Ends the program quietly when nobody reads on, as after `| head`; `println!` would panic.
 fn say(line: &str) {
@@ -35,6 +38,12 @@ fn say(line: &str) {
         }
         std::process::exit(1);
     }
+}
+
+/// Reads what a localizer needs of each bag.
+fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
+    let files = bags.files.iter().map(PathBuf::as_path);
+    files.map(|bag| Ok((bag, read_bag(bag, &bags.topics)?))).collect()
 }
 
 /// Reads what a localizer needs of a bag.
@@ -50,6 +59,11 @@ fn topics(arguments: &TopicArguments) -> Topics {
         truth: arguments.truth_topic.clone(),
         imu: arguments.imu_topic.clone(),
     }
+}
+
+fn load_map(path: &Path) -> anyhow::Result<Arc<TrackMap>> {
+    let map = TrackMap::new(OccupancyGrid::load(path)?).with_context(|| path.display().to_string())?;
+    Ok(Arc::new(map))
 }
 
 /// Where the laser is, with a warning when that is a guess.

@@ -155,22 +155,16 @@ fn name(quality: Quality) -> &'static str {
 
 /// The paper's grid.
 fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyhow::Result<()> {
-    let rows = [
-        ("hq", Quality::Hq),
-        ("lq", Quality::Lq),
-        ("synpf-baseline", Quality::Hq),
-        ("synpf-baseline", Quality::Lq),
-    ]
-    .map(|(set, quality)| shipped(set).map(|(localizer, guide)| (localizer, guide, quality)));
-    let mut rows = rows.into_iter().collect::<anyhow::Result<Vec<_>>>()?;
-    for quality in [Quality::Hq, Quality::Lq] {
-        rows.push(("odometry".into(), Guide::Odometry, quality));
-    }
-    for quality in [Quality::Hq, Quality::Lq] {
-        rows.push(("truth".into(), Guide::Truth, quality));
+    let mut rows = vec![(shipped("hq")?, Quality::Hq), (shipped("lq")?, Quality::Lq)];
+    for guide in [
+        shipped("synpf-baseline")?,
+        ("odometry".into(), Guide::Odometry),
+        ("truth".into(), Guide::Truth),
+    ] {
+        rows.extend([Quality::Hq, Quality::Lq].map(|quality| (guide.clone(), quality)));
     }
     let mut reports = Vec::new();
-    for (localizer, guide, quality) in rows {
+    for ((localizer, guide), quality) in rows {
         let mut report = races(arguments, track, map, localizer, guide, quality)?;
         report.races.clear();
         reports.push(report);
@@ -304,10 +298,10 @@ fn print_one(report: &Report) {
     line("alignment, paper's", or_dash(s.alignment_paper, 100.0, 2), "%");
     line("alignment, ours", or_dash(s.alignment, 100.0, 2), "%");
     if !s.states.is_empty() {
-        let shares = s.states.iter().map(|(state, share)| {
-            let state = format!("{state:?}").to_uppercase();
-            format!("{state} {:.2} %", share * 100.0)
-        });
+        let shares = s
+            .states
+            .iter()
+            .map(|(state, share)| format!("{state} {:.2} %", share * 100.0));
         line("states", shares.collect::<Vec<_>>().join(", "), "");
         line("LOST though right", s.false_lost.to_string(), "updates");
         line("LOCALIZED though wrong", s.false_localized.to_string(), "updates");

@@ -2,33 +2,13 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use serde::Serialize;
 use synpf::{Mode, Stamp, Update};
 
 use super::fit::Fit;
 use super::rules::{Evidence, Family, Finding, findings};
-use super::{Cause, CauseKind, Metrics, Severity, Thresholds};
+use super::{Cause, CauseKind, Metrics, Severity, State, Thresholds};
 use crate::evaluate::percentile;
-
-/// What the car knows of its own pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum State {
-    /// No pose yet.
-    Init,
-    /// A pose, not yet confirmed.
-    Converging,
-    /// The pose can be raced on.
-    Localized,
-    /// The pose is probably right; something is wrong.
-    Degraded,
-    /// The pose is wrong.
-    Lost,
-    /// Searching the whole map.
-    Relocalizing,
-    /// No sensor data.
-    Stale,
-}
+use crate::wire::finite;
 
 /// The state, with all that led to it.
 #[derive(Debug, Clone, PartialEq)]
@@ -327,14 +307,14 @@ impl Monitor {
             value: None,
             limit: None,
         };
+        let measured = |kind, severity, value, limit| Cause {
+            value: Some(finite(value)),
+            limit: Some(finite(limit)),
+            ..plain(kind, severity)
+        };
         let mut causes: Vec<Cause> = missing
             .into_iter()
-            .map(|(kind, silence)| Cause {
-                kind,
-                severity: Severity::Critical,
-                value: Some(silence),
-                limit: Some(self.thresholds.stale_after),
-            })
+            .map(|(kind, silence)| measured(kind, Severity::Critical, silence, self.thresholds.stale_after))
             .collect();
         match self.verdict.state {
             State::Init => causes.push(plain(CauseKind::NoInitialPose, Severity::Warning)),
@@ -349,12 +329,7 @@ impl Monitor {
             self.findings
                 .iter()
                 .filter(|finding| !finding.degrades || self.lasting(finding))
-                .map(|finding| Cause {
-                    kind: finding.kind,
-                    severity: finding.severity,
-                    value: Some(finding.value),
-                    limit: Some(finding.limit),
-                }),
+                .map(|f| measured(f.kind, f.severity, f.value, f.limit)),
         );
         causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
         causes

@@ -23,37 +23,29 @@ pub struct PaperRow {
 }
 
 /// The table.
+#[rustfmt::skip]
 pub const PAPER_ROWS: [PaperRow; 4] = [
-    PaperRow {
-        localizer: "SynPF",
-        quality: Quality::Hq,
-        lap_time_s: [9.184, 0.153],
-        line_error_m: [0.082_23, 0.004_06],
-        alignment: 0.806_03,
-        load: Some(2.17),
-    },
-    PaperRow {
-        localizer: "SynPF",
-        quality: Quality::Lq,
-        lap_time_s: [9.280, 0.093],
-        line_error_m: [0.076_86, 0.011_79],
-        alignment: 0.799_24,
-        load: None,
-    },
-    PaperRow {
-        localizer: "Cartographer",
-        quality: Quality::Hq,
-        lap_time_s: [9.167, 0.097],
-        line_error_m: [0.068_64, 0.002_64],
-        alignment: 0.693_57,
-        load: Some(4.2),
-    },
-    PaperRow {
-        localizer: "Cartographer",
-        quality: Quality::Lq,
-        lap_time_s: [9.428, 0.126],
-        line_error_m: [0.114_32, 0.011_34],
-        alignment: 0.617_10,
-        load: None,
-    },
+    row("SynPF", Quality::Hq, [9.184, 0.153], [8.223, 0.406], 80.603, Some(2.17)),
+    row("SynPF", Quality::Lq, [9.280, 0.093], [7.686, 1.179], 79.924, None),
+    row("Cartographer", Quality::Hq, [9.167, 0.097], [6.864, 0.264], 69.357, Some(4.2)),
+    row("Cartographer", Quality::Lq, [9.428, 0.126], [11.432, 1.134], 61.710, None),
 ];
+
+/// A row in the paper's units: centimetres and percent.
+const fn row(
+    localizer: &'static str,
+    quality: Quality,
+    lap_time_s: [f64; 2],
+    line_error_cm: [f64; 2],
+    alignment_percent: f64,
+    load: Option<f64>,
+) -> PaperRow {
+    PaperRow {
+        localizer,
+        quality,
+        lap_time_s,
+        line_error_m: [line_error_cm[0] / 100.0, line_error_cm[1] / 100.0],
+        alignment: alignment_percent / 100.0,
+        load,
+    }
+}

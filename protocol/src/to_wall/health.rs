@@ -31,7 +31,7 @@ impl Health {
 }
 
 /// What the car knows of its own pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
     /// No pose yet.
@@ -181,11 +181,11 @@ impl fmt::Display for Cause {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// Good to know.
+    /// Good to know; the state does not depend on it.
     Info,
-    /// Keep an eye on it.
+    /// Makes the state DEGRADED where it concerns the pose.
     Warning,
-    /// Act now.
+    /// Evidence that the pose is wrong, or that there is none.
     Critical,
 }
 

@@ -1,16 +1,18 @@
 //! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
-//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, and waiting for conditions.
+//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, the processor time that the host takes away, and waiting for conditions.
 
 #[cfg(feature = "browser")]
 mod browser;
 mod fake_car;
 mod real_car;
+mod stolen;
 mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
 pub use real_car::start_real;
+pub use stolen::stolen;
 pub use synthetic_bag::{room, true_pose, write_bag};
 
 use std::net::TcpListener;

@@ -72,12 +72,11 @@ impl Library {
     fn missing(&self, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
         let payload = payload.ok_or("this question needs a payload")?;
         let (_, request) = decode::<MissingRequest>(payload).map_err(|error| error.to_string())?;
-        let reply = self
-            .archive
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .find(self.session_number, &request);
+        let archive = self.archive.lock().unwrap_or_else(PoisonError::into_inner);
+        let reply = archive.find(self.session_number, &request);
+        // A recording ends here: what is published later is not among the last numbers.
         let now = wall_now().0;
+        drop(archive);
         let stamps = Stamps {
             session: self.session_number,
             sequence: 0,

@@ -8,10 +8,19 @@
 //!
 //! One question per car is on its way at a time, and its answer is short: over a slow link it takes no more than its share,
 //! over a fast one the next follows at once.
+//!
+//! There is one of these per link: a page and the recorder behind it share what was asked for. Several programs on one
+//! laptop do not: each asks for itself, and over a slow link what is missing goes once to each. Where that counts, record
+//! from the page.
+//!
+//! When a recording ends, a last call asks every car for its last numbers, and what it had sent by then is asked for at
+//! once: without it the streams would end up to [`POLL`] and [`ON_ITS_WAY`] apart.
 
 use std::collections::BTreeMap;
 
 use protocol::{CarName, Kept, MissingRequest, Topic, Wanted};
+
+use crate::event::Sent;
 
 /// Messages of a stream that are asked for when its sender is found; of events all.
 const HISTORY: u64 = 100;
@@ -23,6 +32,8 @@ const POLL: i64 = SECOND;
 const AGAIN: i64 = SECOND / 3;
 /// A message that was sent is on its way for so long before it counts as missing [ns].
 const ON_ITS_WAY: i64 = SECOND;
+/// Both when a recording is about to end [ns].
+const LAST_CALL: i64 = SECOND / 10;
 /// Bounds of what an answer may hold [bytes], and the round trip between which it grows and shrinks [ns].
 const BUDGET: [u32; 2] = [4_000, 48_000];
 const ROUND_TRIP: [i64; 2] = [SECOND / 20, SECOND / 5];
@@ -79,6 +90,37 @@ struct Car<T> {
     /// When to ask next [unix ns].
     due: i64,
     budget: u32,
+    last_call: Option<LastCall>,
+}
+
+/// How a car stands with a last call.
+#[derive(Debug)]
+enum LastCall {
+    /// It was made at this time, and is not answered yet [unix ns].
+    Made(i64),
+    /// The car's session, and the last number of each stream.
+    Answered(u64, Vec<Sent>),
+    /// Nobody answered.
+    Silent,
+}
+
+/// What is still to come after a last call; the less, the smaller.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Outstanding {
+    /// Cars that have not answered it.
+    pub(crate) cars: u64,
+    /// Messages that those which have answered had sent by then.
+    pub(crate) messages: u64,
+}
+
+impl Outstanding {
+    /// Nothing is known yet.
+    pub(crate) const MOST: Self = Self {
+        cars: u64::MAX,
+        messages: u64::MAX,
+    };
+    /// All is there.
+    pub(crate) const NOTHING: Self = Self { cars: 0, messages: 0 };
 }
 
 impl<T> Default for Car<T> {
@@ -89,6 +131,7 @@ impl<T> Default for Car<T> {
             asked: None,
             due: 0,
             budget: BUDGET[0],
+            last_call: None,
         }
     }
 }
@@ -99,15 +142,42 @@ impl<T> CatchUp<T> {
         self.cars.entry(car.clone()).or_default().due = 0;
     }
 
-    /// Asks for the full-rate streams, too, or no more.
-    pub(crate) fn want_recorded(&mut self, on: bool) {
+    /// Asks for the full-rate streams, too, or no more. Returns what was held back for a recording that ends.
+    pub(crate) fn want_recorded(&mut self, on: bool) -> Vec<T> {
         self.recorded = on;
+        let mut out = Vec::new();
         for car in self.cars.values_mut() {
             car.due = 0;
+            car.last_call = None;
             if !on {
+                let streams = car.streams.values_mut();
+                let held = streams.flat_map(|stream| std::mem::take(&mut stream.held).into_values());
+                out.extend(held.map(|(_, message)| message));
                 car.streams.retain(|topic, _| !topic.recorded());
             }
         }
+        out
+    }
+
+    /// Asks every car at `now` [unix ns] how far its streams go, and for all that it has sent by then.
+    pub(crate) fn last_call(&mut self, now: i64) {
+        for car in self.cars.values_mut() {
+            car.last_call = Some(LastCall::Made(now));
+            car.due = 0;
+        }
+    }
+
+    /// What is still to come after the last call.
+    pub(crate) fn outstanding(&self) -> Outstanding {
+        let mut outstanding = Outstanding::NOTHING;
+        for car in self.cars.values() {
+            match &car.last_call {
+                Some(LastCall::Made(_)) => outstanding.cars += 1,
+                Some(LastCall::Answered(..)) => outstanding.messages += car.outstanding(),
+                Some(LastCall::Silent) | None => {}
+            }
+        }
+        outstanding
     }
 
     /// Takes in a message that came at `at` [unix ns]. Returns what can be handed on now, in order.
@@ -186,7 +256,7 @@ impl<T> CatchUp<T> {
     }
 
     /// A car has answered at `now` [unix ns]: what it sent has been taken in, `kept` is what else it said. Returns what need
-    /// not be held back any more.
+    /// not be held back any more, and, as the answer to a last call, how far each stream goes of which something is to come.
     pub(crate) fn answered(
         &mut self,
         car: &CarName,
@@ -194,10 +264,11 @@ impl<T> CatchUp<T> {
         kept: &[Kept],
         more: bool,
         now: i64,
-    ) -> Vec<T> {
+    ) -> (Vec<T>, Option<Vec<Sent>>) {
         let recorded = self.recorded;
         let car = self.cars.entry(car.clone()).or_default();
         let mut out = car.follow(session);
+        let answers_last_call = car.answers_last_call();
         if let Some(asked) = car.asked.take() {
             let [least, most] = BUDGET;
             let [short, long] = ROUND_TRIP;
@@ -207,6 +278,8 @@ impl<T> CatchUp<T> {
                 _ => car.budget,
             };
         }
+        let on_its_way = car.last_call.as_ref().map_or(ON_ITS_WAY, |_| LAST_CALL);
+        let mut sent = Vec::new();
         for kept in kept {
             if !kept.topic.recovered() || kept.topic.recorded() && !recorded {
                 continue;
@@ -215,23 +288,37 @@ impl<T> CatchUp<T> {
                 .streams
                 .entry(kept.topic)
                 .or_insert_with(|| Stream::new(false));
-            stream.kept(*kept, now, &mut out);
+            stream.kept(*kept, now, on_its_way, &mut out);
+            let (topic, from, to) = (kept.topic, stream.next(), kept.last);
+            if from <= to {
+                sent.push(Sent { topic, from, to });
+            }
+        }
+        if answers_last_call {
+            car.last_call = Some(LastCall::Answered(session, sent.clone()));
         }
         let missing = car.streams.values().any(|stream| !stream.holes.is_empty());
-        car.due = match (missing, more) {
-            (true, true) => now,
-            (true, false) => now + AGAIN,
-            (false, _) => now + POLL,
+        car.due = match (missing, more, &car.last_call) {
+            (true, true, _) | (_, _, Some(LastCall::Made(_))) => now,
+            (_, _, Some(LastCall::Answered(..))) if car.outstanding() > 0 => now + LAST_CALL,
+            (true, false, _) => now + AGAIN,
+            (false, _, _) => now + POLL,
         };
-        out
+        (out, answers_last_call.then_some(sent))
     }
 
     /// Nobody has answered by `now` [unix ns].
     pub(crate) fn unanswered(&mut self, car: &CarName, now: i64) {
         let car = self.cars.entry(car.clone()).or_default();
+        if car.answers_last_call() {
+            car.last_call = Some(LastCall::Silent);
+        }
         car.asked = None;
         car.budget = BUDGET[0];
-        car.due = now + AGAIN;
+        car.due = match car.last_call {
+            Some(LastCall::Made(_)) => now,
+            _ => now + AGAIN,
+        };
     }
 }
 
@@ -253,6 +340,22 @@ impl<T> Car<T> {
         }
         self.session = Some(session);
         out
+    }
+
+    /// True when the question on its way was put after a last call, which nobody has answered yet.
+    fn answers_last_call(&self) -> bool {
+        matches!((&self.last_call, self.asked), (Some(LastCall::Made(at)), Some(asked)) if asked >= *at)
+    }
+
+    /// Messages to come of those that the car had sent when it answered the last call.
+    fn outstanding(&self) -> u64 {
+        let Some(LastCall::Answered(session, sent)) = &self.last_call else {
+            return 0;
+        };
+        let streams = sent.iter().filter(|_| self.session == Some(*session));
+        streams
+            .filter_map(|sent| Some(self.streams.get(&sent.topic)?.lacks_up_to(sent.to)))
+            .sum()
     }
 }
 
@@ -302,8 +405,8 @@ impl<T> Stream<T> {
         self.release(out);
     }
 
-    /// Takes note of what the car still has.
-    fn kept(&mut self, kept: Kept, now: i64, out: &mut Vec<T>) {
+    /// Takes note of what the car still has. What it sent is on its way for so long before it counts as missing [ns].
+    fn kept(&mut self, kept: Kept, now: i64, on_its_way: i64, out: &mut Vec<T>) {
         let Kept { topic, first, last } = kept;
         if !self.begun {
             self.begun = true;
@@ -328,7 +431,7 @@ impl<T> Stream<T> {
             from <= to
         });
         match self.tail {
-            Some((number, since)) if number > self.highest && now - since >= ON_ITS_WAY => {
+            Some((number, since)) if number > self.highest && now - since >= on_its_way => {
                 self.miss([self.highest + 1, number], since);
                 self.highest = number;
                 self.tail = None;
@@ -375,6 +478,23 @@ impl<T> Stream<T> {
         true
     }
 
+    /// The first number that has not been handed on.
+    fn next(&self) -> u64 {
+        let hole = self.holes.first().map(|([from, _], _)| *from);
+        let held = self.held.keys().next().copied();
+        let next = hole.into_iter().chain(held).min();
+        next.unwrap_or(self.highest + 1)
+    }
+
+    /// How many numbers up to `last` have not come.
+    fn lacks_up_to(&self, last: u64) -> u64 {
+        let holes = self
+            .holes
+            .iter()
+            .map(|([from, to], _)| (*to.min(&last) + 1).saturating_sub(*from));
+        holes.sum::<u64>() + last.saturating_sub(self.highest)
+    }
+
     /// What to ask for: the oldest ranges.
     fn wanted(&self) -> Vec<[u64; 2]> {
         let ranges = self.holes.iter().map(|(range, _)| *range);
@@ -399,6 +519,8 @@ mod tests {
         car: CarName,
         now: i64,
         out: Vec<u64>,
+        /// The answers to last calls.
+        sent: Vec<Vec<Sent>>,
     }
 
     impl Wall {
@@ -412,6 +534,7 @@ mod tests {
                 car,
                 now: SECOND,
                 out: Vec::new(),
+                sent: Vec::new(),
             }
         }
 
@@ -453,11 +576,17 @@ mod tests {
                 last,
             };
             let more = !sent.is_empty();
-            self.out.extend(
-                self.catch_up
-                    .answered(&self.car, SESSION, &[kept], more, self.now),
-            );
+            let (out, sent) = self
+                .catch_up
+                .answered(&self.car, SESSION, &[kept], more, self.now);
+            self.out.extend(out);
+            self.sent.extend(sent);
             ranges
+        }
+
+        fn outstanding(&self) -> (u64, u64) {
+            let Outstanding { cars, messages } = self.catch_up.outstanding();
+            (cars, messages)
         }
 
         fn wait(&mut self, seconds: f64) {
@@ -525,6 +654,59 @@ mod tests {
         wall.wait(1.0);
         assert_eq!(wall.ask(1, 2, 1), [[2, 2]]);
         assert_eq!(wall.out, [1, 2]);
+    }
+
+    #[test]
+    fn a_last_call_brings_what_was_sent_by_then_within_tenths_of_a_second() {
+        let mut wall = Wall::new();
+        wall.arrive([1]);
+        wall.ask(1, 1, 0);
+        wall.arrive([2, 4]);
+        wall.wait(0.05);
+        wall.catch_up.last_call(wall.now);
+        assert_eq!(wall.outstanding(), (1, 0));
+        assert_eq!(wall.ask(1, 6, 0), [[3, 3]]);
+        let sent = Sent {
+            topic: TOPIC,
+            from: 3,
+            to: 6,
+        };
+        assert_eq!(wall.sent, [[sent]]);
+        assert_eq!(wall.outstanding(), (0, 3), "3, 5 and 6");
+        wall.arrive([7]);
+        assert_eq!(wall.outstanding(), (0, 3), "7 was sent after it");
+        wall.wait(0.1);
+        assert_eq!(wall.ask(1, 9, 9), [[3, 3], [5, 6]]);
+        assert_eq!((wall.outstanding(), wall.sent.len()), ((0, 0), 1));
+        assert_eq!(wall.out, [1, 2, 3, 4, 5, 6, 7]);
+    }
+
+    #[test]
+    fn a_last_call_is_not_answered_by_what_was_asked_before_it() {
+        let mut wall = Wall::new();
+        let early = wall.catch_up.due(wall.now);
+        assert_eq!(early.len(), 1);
+        wall.wait(0.1);
+        wall.catch_up.last_call(wall.now);
+        let (_, sent) = wall.catch_up.answered(&wall.car, SESSION, &[], false, wall.now);
+        assert_eq!((sent, wall.outstanding()), (None, (1, 0)));
+        wall.ask(1, 1, 0);
+        assert_eq!(wall.outstanding(), (0, 1));
+    }
+
+    #[test]
+    fn a_silent_car_is_not_waited_for_and_what_came_of_it_is_handed_on() {
+        let mut wall = Wall::new();
+        wall.arrive([1]);
+        wall.ask(1, 1, 0);
+        wall.arrive([3, 5]);
+        wall.wait(1.0);
+        wall.catch_up.last_call(wall.now);
+        assert_eq!(wall.catch_up.due(wall.now).len(), 1);
+        wall.catch_up.unanswered(&wall.car, wall.now);
+        assert_eq!(wall.outstanding(), (0, 0));
+        assert_eq!(wall.out, [1]);
+        assert_eq!(wall.catch_up.want_recorded(false), [3, 5]);
     }
 
     #[test]

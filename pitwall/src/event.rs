@@ -65,6 +65,26 @@ pub enum Happening {
         /// Round-trip time; the offset is right to within half of it [ns].
         round_trip: i64,
     },
+    /// The car has said how far its streams go, because a recording is about to end: here.
+    HowFar {
+        /// Its session.
+        session: u64,
+        /// When it said so, by its own clock [unix ns].
+        said: i64,
+        /// The streams that must be whole of which something is still to come.
+        streams: Vec<Sent>,
+    },
+}
+
+/// Numbers of a stream that were sent and have not been handed on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sent {
+    /// The stream.
+    pub topic: Topic,
+    /// The first of them.
+    pub from: u64,
+    /// The last.
+    pub to: u64,
 }
 
 /// How a message came in.

@@ -72,6 +72,7 @@ impl Fleet {
                 self.say(at, car, Severity::Info, "marker", text, who);
             }
             Happening::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
+            Happening::HowFar { .. } => {}
         }
         self.notice_link(&name.clone(), at);
     }

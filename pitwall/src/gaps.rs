@@ -44,19 +44,8 @@ impl Gaps {
         if sequence == 0 {
             return Arrival::New;
         }
-        if self.received == 0 || session > self.session {
-            if self.received > 0 {
-                self.restarts += 1;
-                self.missing_before += self.missing_now();
-                self.missing.clear();
-                // A new sender's first message is number 1: what precedes the one that came is missing.
-                if sequence > 1 {
-                    self.missing.push(1..=sequence - 1);
-                }
-            }
-            self.session = session;
-            self.first = sequence;
-            self.last = sequence;
+        if self.last == 0 || session > self.session {
+            self.begin(session, sequence);
             self.received += 1;
             return Arrival::New;
         }
@@ -66,11 +55,7 @@ impl Gaps {
         if sequence > self.last {
             let gap = sequence > self.last + 1;
             if gap {
-                if self.missing.len() == Self::MAX_RANGES {
-                    let oldest = self.missing.remove(0);
-                    self.missing_before += oldest.end() - oldest.start() + 1;
-                }
-                self.missing.push(self.last + 1..=sequence - 1);
+                self.miss(self.last + 1..=sequence - 1);
             }
             self.last = sequence;
             self.received += 1;
@@ -87,6 +72,44 @@ impl Gaps {
         self.received += 1;
         self.filled += 1;
         Arrival::Late
+    }
+
+    /// Takes note that the messages up to number `to` were sent. Where none has come yet, the count begins with `from`.
+    pub fn sent(&mut self, session: u64, from: u64, to: u64) {
+        if session < self.session || to < from || from == 0 {
+            return;
+        }
+        if self.last == 0 || session > self.session {
+            self.begin(session, from);
+            self.miss(from..=to);
+        } else if to > self.last {
+            self.miss(self.last + 1..=to);
+        }
+        self.last = self.last.max(to);
+    }
+
+    /// Begins with this number of a session.
+    fn begin(&mut self, session: u64, number: u64) {
+        if self.last > 0 {
+            self.restarts += 1;
+            self.missing_before += self.missing_now();
+            self.missing.clear();
+            // A new sender's first message is number 1: what precedes the one that came is missing.
+            if number > 1 {
+                self.missing.push(1..=number - 1);
+            }
+        }
+        self.session = session;
+        self.first = number;
+        self.last = number;
+    }
+
+    fn miss(&mut self, range: RangeInclusive<u64>) {
+        if self.missing.len() == Self::MAX_RANGES {
+            let oldest = self.missing.remove(0);
+            self.missing_before += oldest.end() - oldest.start() + 1;
+        }
+        self.missing.push(range);
     }
 
     /// Different messages that came.
@@ -109,7 +132,7 @@ impl Gaps {
         self.missing_before + self.missing_now()
     }
 
-    /// The highest number that came.
+    /// The highest number that came or is known to have been sent.
     pub fn last(&self) -> u64 {
         self.last
     }
@@ -135,9 +158,9 @@ impl Gaps {
 /// What came of a stream and what did not.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct GapSummary {
-    /// The first number that came, of the sender's last session.
+    /// The number with which the count begins, of the sender's last session.
     pub first: u64,
-    /// The highest number that came.
+    /// The highest number that came or is known to have been sent.
     pub last: u64,
     /// Different messages that came.
     pub received: u64,
@@ -195,6 +218,30 @@ mod tests {
         let summary = gaps.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (3, 1));
         assert_eq!(summary.missing_ranges, [[1, 2]]);
+    }
+
+    #[test]
+    fn what_is_known_to_have_been_sent_is_missing_until_it_comes() {
+        let mut gaps = gaps(&[5, 6]);
+        gaps.sent(1, 5, 6);
+        assert_eq!(gaps.missing(), 0);
+        gaps.sent(1, 7, 9);
+        assert_eq!((gaps.last(), gaps.summary().missing_ranges), (9, vec![[7, 9]]));
+        assert_eq!(gaps.arrive(1, 8), Arrival::Late);
+        assert_eq!(gaps.arrive(1, 10), Arrival::New);
+        assert_eq!(gaps.summary().missing_ranges, [[7, 7], [9, 9]]);
+
+        let mut nothing_came = Gaps::default();
+        nothing_came.sent(1, 3, 5);
+        assert_eq!((nothing_came.missing(), nothing_came.received()), (3, 0));
+        assert_eq!(nothing_came.arrive(1, 3), Arrival::Late);
+        assert_eq!(nothing_came.missing(), 2);
+
+        nothing_came.sent(2, 1, 2);
+        let summary = nothing_came.summary();
+        assert_eq!((summary.missing, summary.sender_restarts), (4, 1));
+        nothing_came.sent(1, 1, 9);
+        assert_eq!(nothing_came.summary(), summary, "a straggler of the old session");
     }
 
     #[test]

@@ -10,6 +10,7 @@ use protocol::CarName;
 use tokio::task::JoinHandle;
 
 use crate::board::{Board, FleetGuard};
+use crate::catch_up::Outstanding;
 use crate::event::{FleetEvent, Happening};
 use crate::fleet::Fleet;
 use crate::link::{Link, LinkError, Role, unix_now};
@@ -32,10 +33,10 @@ impl Hub {
     const REPORT_LINKS: Duration = Duration::from_secs(1);
     /// How often clocks are compared.
     const COMPARE_CLOCKS: Duration = Duration::from_secs(2);
-    /// When a recording is about to end, gaps are waited for while one is filled at least this often...
-    const FILL_GAPS: Duration = Duration::from_millis(1500);
+    /// When a recording is about to end, what is missing is waited for while something comes at least this often...
+    const LAST_CALL: Duration = Duration::from_millis(1500);
     /// ...but no longer than this in all.
-    const FILL_GAPS_AT_MOST: Duration = Duration::from_secs(15);
+    const LAST_CALL_AT_MOST: Duration = Duration::from_secs(15);
 
     /// Opens the link. Needs a multi-thread tokio runtime.
     pub async fn open(role: &Role) -> Result<Arc<Self>, LinkError> {
@@ -107,23 +108,41 @@ impl Hub {
         Ok(())
     }
 
-    /// Ends the recording and says what is in it. None when there was none.
+    /// Ends the recording and says what is in it. Every car is asked for what it has sent by now, so that all its streams
+    /// end together; that is waited for while something comes. None when there was none.
     pub async fn stop_recording(&self) -> Option<Result<Summary, RecordingError>> {
-        let begun = Instant::now();
-        let (mut filled, mut fewest) = (begun, u64::MAX);
-        while filled.elapsed() < Self::FILL_GAPS && begun.elapsed() < Self::FILL_GAPS_AT_MOST {
-            match self.recording().map_or(0, |status| status.summary.missing()) {
-                0 => break,
-                missing if missing < fewest => (filled, fewest) = (Instant::now(), missing),
-                _ => {}
-            }
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
-        let recorder = self.board.recorder().take()?;
+        self.recording_path()?;
+        self.await_last_messages().await;
+        self.cut_recording().await
+    }
+
+    /// Ends the recording with what has come, and says what is in it. None when there was none.
+    pub async fn cut_recording(&self) -> Option<Result<Summary, RecordingError>> {
+        // What was held back until gaps are filled goes in first.
         if let Err(error) = self.link.subscribe_recorded(false).await {
             tracing::warn!(%error, "still subscribed to the full-rate streams");
         }
+        let recorder = self.board.recorder().take()?;
         tokio::task::spawn_blocking(move || recorder.finish()).await.ok()
+    }
+
+    async fn await_last_messages(&self) {
+        let mut outstanding = self.link.last_call();
+        let begun = Instant::now();
+        let (mut came, mut least) = (begun, Outstanding::MOST);
+        loop {
+            match *outstanding.borrow_and_update() {
+                Outstanding::NOTHING => return,
+                less if less < least => (came, least) = (Instant::now(), less),
+                _ => {}
+            }
+            let left = Self::LAST_CALL.saturating_sub(came.elapsed());
+            let left = left.min(Self::LAST_CALL_AT_MOST.saturating_sub(begun.elapsed()));
+            match tokio::time::timeout(left, outstanding.changed()).await {
+                Ok(Ok(())) => {}
+                Ok(Err(_)) | Err(_) => return,
+            }
+        }
     }
 
     /// How the recording is getting on; None when there is none.

@@ -39,7 +39,7 @@ mod web;
 pub use ask::{PATIENCE, Verdict, new_command_id};
 pub use board::{Board, FleetGuard};
 pub use car::{Car, CarView, PoseView, SetView};
-pub use event::{FleetEvent, Happening, Lane};
+pub use event::{FleetEvent, Happening, Lane, Sent};
 pub use fleet::Fleet;
 pub use gaps::{Arrival, GapSummary, Gaps};
 pub use history::{Moment, Place};

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossbeam_channel::{Receiver, Sender, select};
 use protocol::{CarName, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
@@ -19,7 +19,7 @@ use zenoh::sample::{Sample, SampleKind};
 use zenoh::{Config, Session};
 
 use crate::ask::{first_answer, stamps};
-use crate::catch_up::{CatchUp, Place, Question};
+use crate::catch_up::{CatchUp, Outstanding, Place, Question};
 use crate::event::{FleetEvent, Happening, Lane};
 
 /// Where a pit wall listens for cars unless told otherwise.
@@ -169,6 +169,7 @@ impl Link {
             catch_up: CatchUp::default(),
             sink: sink.clone(),
             questions,
+            last_call: None,
         };
         std::thread::Builder::new()
             .name("decode".to_owned())
@@ -212,7 +213,7 @@ impl Link {
         });
     }
 
-    /// Subscribes to the full-rate streams, or ends that.
+    /// Subscribes to the full-rate streams, or ends that; by then what was held back of them has been handed on.
     pub async fn subscribe_recorded(&self, on: bool) -> Result<(), LinkError> {
         let mut subscribers = Vec::new();
         if on {
@@ -220,13 +221,25 @@ impl Link {
                 subscribers.push(listen(&self.session, topic, Lane::Complete, &self.arrivals).await?);
             }
         }
-        self.arrivals.try_send(Arrival::WantRecorded(on)).ok();
+        let (done, handed_on) = oneshot::channel();
+        // Full of messages, or closed: then there is nothing to wait for.
+        self.arrivals.try_send(Arrival::WantRecorded(on, done)).ok();
+        handed_on.await.ok();
         let before = std::mem::replace(
             &mut *self.recorded.lock().unwrap_or_else(PoisonError::into_inner),
             subscribers,
         );
         drop(before);
         Ok(())
+    }
+
+    /// Asks every car how far its streams go ([`Happening::HowFar`]), and for all that it has sent by then. Tells what is
+    /// still to come.
+    pub(crate) fn last_call(&self) -> watch::Receiver<Outstanding> {
+        let (tell, outstanding) = watch::channel(Outstanding::MOST);
+        // Full of messages, or closed: the other end is dropped, which says so.
+        self.arrivals.try_send(Arrival::LastCall(tell)).ok();
+        outstanding
     }
 
     /// Closes the session; gives up after two seconds, because a session whose network has died takes longer.
@@ -307,15 +320,16 @@ const MISSING_PATIENCE: Duration = Duration::from_secs(3);
 enum Arrival {
     Sample { at: i64, lane: Lane, sample: Sample },
     Appeared(CarName),
-    WantRecorded(bool),
+    WantRecorded(bool, oneshot::Sender<()>),
+    LastCall(watch::Sender<Outstanding>),
 }
 
 /// What became of a question for what is missing.
 struct Answered {
     at: i64,
     car: CarName,
-    /// The car's session and its answer; None when it did not answer.
-    reply: Option<(u64, MissingReply)>,
+    /// None when it did not answer.
+    reply: Option<(Header, MissingReply)>,
 }
 
 /// A message of a known car and topic.
@@ -331,6 +345,8 @@ struct Decoding {
     catch_up: CatchUp<Received>,
     sink: Sink,
     questions: mpsc::UnboundedSender<Question>,
+    /// Who waits for the end of a recording.
+    last_call: Option<watch::Sender<Outstanding>>,
 }
 
 impl Decoding {
@@ -357,6 +373,9 @@ impl Decoding {
                     self.hand_on(received);
                 }
                 self.ask(now);
+                if let Some(tell) = &self.last_call {
+                    tell.send_replace(self.catch_up.outstanding());
+                }
             }
         }
     }
@@ -371,7 +390,20 @@ impl Decoding {
     fn take_in(&mut self, arrival: Arrival) {
         match arrival {
             Arrival::Appeared(car) => self.catch_up.appeared(&car),
-            Arrival::WantRecorded(on) => self.catch_up.want_recorded(on),
+            Arrival::WantRecorded(on, done) => {
+                self.last_call = None;
+                for received in self.catch_up.want_recorded(on) {
+                    self.hand_on(received);
+                }
+                // Nobody need wait for it.
+                done.send(()).ok();
+            }
+            Arrival::LastCall(tell) => {
+                let now = unix_now();
+                self.catch_up.last_call(now);
+                self.last_call = Some(tell);
+                self.ask(now);
+            }
             Arrival::Sample { at, lane, sample } => {
                 if sample.kind() != SampleKind::Put {
                     return;
@@ -404,7 +436,7 @@ impl Decoding {
     }
 
     fn take_answer(&mut self, Answered { at, car, reply }: Answered) {
-        let Some((session, MissingReply { streams, messages })) = reply else {
+        let Some((header, MissingReply { streams, messages })) = reply else {
             return self.catch_up.unanswered(&car, at);
         };
         let more = !messages.is_empty();
@@ -416,7 +448,19 @@ impl Decoding {
                 bytes: bytes.into(),
             });
         }
-        for received in self.catch_up.answered(&car, session, &streams, more, at) {
+        let (released, how_far) = self.catch_up.answered(&car, header.session, &streams, more, at);
+        if let Some(streams) = how_far {
+            (self.sink)(FleetEvent {
+                at,
+                car,
+                happening: Happening::HowFar {
+                    session: header.session,
+                    said: header.published,
+                    streams,
+                },
+            });
+        }
+        for received in released {
             self.hand_on(received);
         }
     }
@@ -465,7 +509,7 @@ async fn ask_all(
 }
 
 /// Asks a car for what is missing. None without an answer in time.
-async fn ask_for_missing(session: &Session, question: Question) -> Option<(u64, MissingReply)> {
+async fn ask_for_missing(session: &Session, question: Question) -> Option<(Header, MissingReply)> {
     // Ahead of what can wait, behind what an operator waits for.
     let priority = if question.urgent {
         Priority::DataHigh
@@ -475,13 +519,9 @@ async fn ask_for_missing(session: &Session, question: Question) -> Option<(u64, 
     let (car, topic) = (&question.car, Topic::Missing);
     let request = encode(&question.request, stamps()).ok()?;
     let bytes = first_answer(session, car, topic, request, MISSING_PATIENCE, priority).await?;
-    match decode::<MissingReply>(&bytes) {
-        Ok((header, reply)) => Some((header.session, reply)),
-        Err(error) => {
-            tracing::debug!(%car, %error, "an answer that cannot be read");
-            None
-        }
-    }
+    decode::<MissingReply>(&bytes)
+        .inspect_err(|error| tracing::debug!(%car, %error, "an answer that cannot be read"))
+        .ok()
 }
 
 /// How questions and commands travel: ahead of telemetry, and never blocking the sender.

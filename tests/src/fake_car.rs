@@ -25,6 +25,8 @@ pub struct Behaviour {
     pub mute: bool,
     /// It publishes bytes that are no message, as load.
     pub babbles: bool,
+    /// It keeps the full-rate streams and sends of them only what is asked for, as a car does over a slow link.
+    pub withholds: bool,
     /// It starts so much later on its lap than the others, in updates of 25 ms.
     pub behind: u64,
 }
@@ -90,7 +92,7 @@ impl FakeCar {
             session: unix_now() as u64,
         }));
         let running = Arc::new(AtomicBool::new(true));
-        let topics = Topics::declare(&session, &name).await;
+        let topics = Topics::declare(&session, &name, behaviour).await;
         answer_questions(&session, &name, &state, behaviour).await;
         let driver = tokio::spawn(drive(topics, state.clone(), running.clone(), behaviour));
         Self {
@@ -164,11 +166,12 @@ fn config(endpoint: &str) -> Config {
 struct Topics {
     session: Session,
     name: CarName,
+    withholds: bool,
     _alive: zenoh::liveliness::LivelinessToken,
 }
 
 impl Topics {
-    async fn declare(session: &Session, name: &CarName) -> Self {
+    async fn declare(session: &Session, name: &CarName, behaviour: Behaviour) -> Self {
         let key = |topic| Key::new(name.clone(), topic).to_string();
         let alive = session
             .liveliness()
@@ -178,6 +181,7 @@ impl Topics {
         Self {
             session: session.clone(),
             name: name.clone(),
+            withholds: behaviour.withholds,
             _alive: alive,
         }
     }
@@ -188,6 +192,9 @@ impl Topics {
         if topic.recovered() {
             let mut state = state.lock().expect("no panic");
             state.archive.keep(topic, stamps.sequence, bytes.clone());
+        }
+        if topic.recorded() && self.withholds {
+            return;
         }
         let key = Key::new(self.name.clone(), topic).to_string();
         self.session.put(key, bytes).await.expect("sent");
@@ -471,12 +478,13 @@ async fn answer_questions(
                 return;
             };
             let state = sent.lock().expect("no panic");
-            let (session, reply) = (state.session, state.archive.find(state.session, &request));
-            drop(state);
+            let reply = state.archive.find(state.session, &request);
             let stamps = Stamps {
-                session,
+                session: state.session,
+                published: unix_now(),
                 ..Stamps::default()
             };
+            drop(state);
             respond(&query, &missing, encode(&reply, stamps).expect("good"));
         })
         .background()

@@ -224,6 +224,69 @@ async fn a_recording_of_three_cars_holds_every_message() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("session.mcap");
+    hub.start_recording(&file).await.expect("a new file");
+    let slow = Behaviour {
+        withholds: true,
+        ..Behaviour::default()
+    };
+    let car = FakeCar::start("car-1", &endpoint, slow).await;
+    let leaver = FakeCar::start("car-2", &endpoint, Behaviour::default()).await;
+    let recorded = |car: &CarName, topic| {
+        let streams = hub.recording().expect("a recording").summary.streams;
+        let mut streams = streams.iter().filter(|s| s.car == *car && s.topic == topic);
+        streams.next().map_or(0, |s| s.gaps.received)
+    };
+    wait_until("both cars are in the file", || {
+        let cars = [car.name(), leaver.name()];
+        cars.iter().all(|car| recorded(car, Topic::RecordedPose) > 0)
+    })
+    .await;
+    leaver.leave().await;
+
+    // It drives on, so that there is always something that has not come.
+    let by_then = car.published();
+    let summary = hub
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("a good file");
+    hub.close().await;
+    assert_eq!(
+        summary.unanswered.iter().map(CarName::as_str).collect::<Vec<_>>(),
+        ["car-2"],
+        "{summary}"
+    );
+    assert!(summary.to_string().contains("car-2 did not answer at the end"));
+    let mut last = BTreeMap::new();
+    for stream in summary.streams.iter().filter(|s| s.car == *car.name()) {
+        let topic = stream.topic;
+        assert_eq!(stream.gaps.missing, 0, "{summary}");
+        if topic.recovered() {
+            assert!(stream.gaps.last >= by_then[&topic], "{topic} lags: {summary}");
+            last.insert(topic, stream.gaps.last);
+        }
+    }
+    // The car says so between any two messages: of streams that go out together one may be one ahead.
+    let [pose, odometry] = [Topic::RecordedPose, Topic::RecordedOdometry].map(|topic| last[&topic]);
+    assert!(
+        pose.abs_diff(odometry) <= 1 && pose > last[&Topic::Health],
+        "{summary}"
+    );
+    // Live poses do not go on while the others are waited for: one more is in the file than there are of the others.
+    let live = summary
+        .streams
+        .iter()
+        .find(|s| s.car == *car.name() && s.topic == Topic::Pose)
+        .expect("live poses");
+    assert!(live.gaps.last <= pose + 1, "{summary}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_recording_that_was_cut_off_is_recovered() {
     let endpoint = free_endpoint();
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");

@@ -5,10 +5,14 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
+use pitwall::{Hub, RecordingError, Summary};
 
 use super::{FIND, NO_SUCH_CAR, open, time_or_interrupt};
 use crate::cli::LinkOptions;
 use crate::output;
+
+/// A recording that takes longer to end says why.
+const UNREMARKED: Duration = Duration::from_millis(600);
 
 pub(super) async fn record(
     link: &LinkOptions,
@@ -30,7 +34,7 @@ pub(super) async fn record(
         file.display()
     ));
     time_or_interrupt(time).await;
-    let summary = hub.stop_recording().await.context("the recorder is gone")??;
+    let summary = end(&hub).await.context("the recorder is gone")??;
     hub.close().await;
     if json {
         output::say_json(&summary)?;
@@ -42,6 +46,19 @@ pub(super) async fn record(
         return Ok(ExitCode::from(NO_SUCH_CAR));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Ends the recording when all that the cars have sent is in it, or at once when the program is asked to stop once more.
+async fn end(hub: &Hub) -> Option<Result<Summary, RecordingError>> {
+    let patience = async {
+        tokio::time::sleep(UNREMARKED).await;
+        output::note("waiting for what the cars have sent and has not come; Ctrl-C ends it as it is");
+        super::interrupted().await;
+    };
+    tokio::select! {
+        summary = hub.stop_recording() => summary,
+        () = patience => hub.cut_recording().await,
+    }
 }
 
 pub(super) fn recover(file: &Path, output: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::foxglove::{self, Exported};
 use super::note::Note;
-use crate::event::{FleetEvent, Happening};
+use crate::event::{FleetEvent, Happening, Sent};
 use crate::gaps::{Arrival, GapSummary, Gaps};
 
 /// Encoding of messages as they came.
@@ -19,12 +19,28 @@ pub(super) const WIRE_ENCODING: &str = "synpf-v1";
 /// Name of the metadata record that says what is in the file.
 pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
 
+/// A stream being recorded.
+#[derive(Default)]
+struct Recorded {
+    gaps: Gaps,
+    /// When the newest message was published.
+    until: Moment,
+}
+
+/// A moment of a car: its session, and its clock [unix ns].
+type Moment = (u64, i64);
+
+/// How far a car's streams go: what it published later is not recorded, so that they all end together.
+type End = Moment;
+
 /// A recording being written.
 pub(super) struct RecordingFile<W: Write + Seek> {
     writer: Writer<W>,
     channels: HashMap<String, u16>,
     schemas: HashMap<&'static str, u16>,
-    streams: BTreeMap<Key, Gaps>,
+    streams: BTreeMap<Key, Recorded>,
+    /// Where the recording ends, for each car that has said so.
+    ends: BTreeMap<CarName, End>,
     notes: u32,
     messages: u64,
     first: Option<i64>,
@@ -41,6 +57,7 @@ impl<W: Write + Seek> RecordingFile<W> {
             channels: HashMap::new(),
             schemas: HashMap::new(),
             streams: BTreeMap::new(),
+            ends: BTreeMap::new(),
             notes: 0,
             messages: 0,
             first: None,
@@ -48,7 +65,7 @@ impl<W: Write + Seek> RecordingFile<W> {
         })
     }
 
-    /// Writes an event. A message that is in the file already is not written again.
+    /// Writes an event. A message that is in the file already is not written again, and none from after the end.
     pub(super) fn write(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
         let FleetEvent { at, car, happening } = event;
         match happening {
@@ -59,12 +76,17 @@ impl<W: Write + Seek> RecordingFile<W> {
                 bytes,
                 ..
             } => {
-                let key = Key::new(car.clone(), *topic);
-                let name = key.to_string();
-                let gaps = self.streams.entry(key).or_default();
-                if gaps.arrive(header.session, header.sequence) == Arrival::Repeated {
+                let published = (header.session, header.published);
+                if self.ends.get(car).is_some_and(|end| published > *end) {
                     return Ok(());
                 }
+                let key = Key::new(car.clone(), *topic);
+                let name = key.to_string();
+                let stream = self.streams.entry(key).or_default();
+                if stream.gaps.arrive(header.session, header.sequence) == Arrival::Repeated {
+                    return Ok(());
+                }
+                stream.until = stream.until.max(published);
                 let times = Times {
                     arrived: *at,
                     published: header.published,
@@ -87,6 +109,18 @@ impl<W: Write + Seek> RecordingFile<W> {
                 };
                 self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
                 self.write_json(car, &foxglove::export_map(map, *at), times)?;
+            }
+            Happening::HowFar {
+                session,
+                said,
+                streams,
+            } => {
+                self.ends.insert(car.clone(), (*session, *said));
+                for Sent { topic, from, to } in streams {
+                    let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
+                    stream.gaps.sent(*session, *from, *to);
+                }
+                return Ok(());
             }
             other => {
                 if let Some(note) = Note::of(other) {
@@ -114,6 +148,15 @@ impl<W: Write + Seek> RecordingFile<W> {
 
     /// What is in the file.
     pub(super) fn summary(&self) -> Summary {
+        let mut ends = self.ends.clone();
+        for (key, stream) in &self.streams {
+            let end = ends.entry(key.car.clone()).or_default();
+            *end = stream.until.max(*end);
+        }
+        let behind = |car: &CarName, until: Moment| {
+            let end = ends.get(car).copied().unwrap_or(until);
+            (end.0 == until.0).then(|| (end.1 - until.1) as f64 * 1e-9)
+        };
         Summary {
             duration_s: self
                 .first
@@ -123,18 +166,24 @@ impl<W: Write + Seek> RecordingFile<W> {
             streams: self
                 .streams
                 .iter()
-                .map(|(key, gaps)| StreamSummary {
+                .map(|(key, stream)| StreamSummary {
                     car: key.car.clone(),
                     topic: key.topic,
-                    gaps: gaps.summary(),
+                    behind_s: behind(&key.car, stream.until),
+                    gaps: stream.gaps.summary(),
                 })
                 .collect(),
+            unanswered: Vec::new(),
         }
     }
 
     /// Writes the summary and the index, and ends the file.
     pub(super) fn finish(mut self) -> Result<(Summary, W), mcap::McapError> {
-        let summary = self.summary();
+        let mut summary = self.summary();
+        let mut cars: Vec<_> = self.streams.into_keys().map(|key| key.car).collect();
+        cars.dedup();
+        cars.retain(|car| !self.ends.contains_key(car));
+        summary.unanswered = cars;
         let metadata = summary
             .streams
             .iter()
@@ -220,6 +269,8 @@ pub struct Summary {
     pub messages: u64,
     /// Every stream.
     pub streams: Vec<StreamSummary>,
+    /// Cars that did not say at the end how far their streams go: what they sent last may be missing, uncounted.
+    pub unanswered: Vec<CarName>,
 }
 
 /// One stream of a recording.
@@ -229,6 +280,9 @@ pub struct StreamSummary {
     pub car: CarName,
     /// The topic.
     pub topic: Topic,
+    /// How long before the end of the car's recording its last message here was published [s]. The end is when the car
+    /// said how far its streams go, or else its last message on any topic. None where that was before it started again.
+    pub behind_s: Option<f64>,
     /// What came and what did not.
     #[serde(flatten)]
     pub gaps: GapSummary,
@@ -245,13 +299,20 @@ impl fmt::Display for Summary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "{:<12} {:<18} {:>9} {:>9} {:>9} {:>9}",
-            "car", "stream", "first", "last", "received", "missing"
+            "{:<12} {:<18} {:>9} {:>9} {:>9} {:>9} {:>9}",
+            "car", "stream", "first", "last", "received", "missing", "behind"
         )?;
-        for StreamSummary { car, topic, gaps } in &self.streams {
+        for StreamSummary {
+            car,
+            topic,
+            behind_s,
+            gaps,
+        } in &self.streams
+        {
+            let behind = behind_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.2} s"));
             writeln!(
                 f,
-                "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9}",
+                "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9} {behind:>9}",
                 gaps.first, gaps.last, gaps.received, gaps.missing
             )?;
             for [from, to] in gaps.missing_ranges.iter().take(10) {
@@ -260,6 +321,12 @@ impl fmt::Display for Summary {
             if gaps.missing_ranges.len() > 10 {
                 writeln!(f, "{:<31} and {} more ranges", "", gaps.missing_ranges.len() - 10)?;
             }
+        }
+        for car in &self.unanswered {
+            writeln!(
+                f,
+                "{car} did not answer at the end: what it sent last may be missing, too"
+            )?;
         }
         let missing = match self.missing() {
             0 => "nothing is missing".to_owned(),

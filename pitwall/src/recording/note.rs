@@ -55,7 +55,7 @@ impl Note {
                 who: who.to_string(),
                 text: text.to_string(),
             },
-            Happening::Message { .. } | Happening::Map { .. } => return None,
+            Happening::Message { .. } | Happening::Map { .. } | Happening::HowFar { .. } => return None,
         })
     }
 }

@@ -92,7 +92,10 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
             Err(error) => (StatusCode::CONFLICT, error.to_string()).into_response(),
         }
     } else {
-        match hub.stop_recording().await {
+        // It goes on when whoever asked does not wait for it.
+        let hub = hub.clone();
+        let ended = tokio::spawn(async move { hub.stop_recording().await });
+        match ended.await.ok().flatten() {
             Some(Ok(summary)) => {
                 let (messages, missing) = (summary.messages, summary.missing());
                 let severity = if missing > 0 {

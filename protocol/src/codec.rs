@@ -4,6 +4,8 @@
 //! `u32`, and a number takes what its type takes. bincode has no maintainer any more; swapping it means this file
 //! and new golden bytes.
 
+use serde::de::DeserializeOwned;
+
 use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 
 use crate::{Header, HeaderError, Invalid, Message, Stamps, finite};
@@ -26,7 +28,8 @@ pub fn encode<M: Message>(message: &M, stamps: Stamps) -> Result<Vec<u8>, CodecE
     Ok(bytes)
 }
 
-/// Reads a message: the whole of `bytes`, every value checked.
+/// Reads a message: the whole of `bytes`, every value checked. One of an older version comes as the present one; the header
+/// says which it was.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<(Header, M), CodecError> {
     let header = Header::read(bytes)?;
     if header.schema != M::SCHEMA {
@@ -35,25 +38,44 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<(Header, M), CodecError> {
             expected: M::SCHEMA,
         });
     }
-    if header.version != M::VERSION {
-        return Err(CodecError::Version {
+    let payload = Payload(&bytes[Header::LEN..]);
+    fits::<M>(payload.0.len())?;
+    let message = if header.version == M::VERSION {
+        payload.read::<M>()?
+    } else {
+        M::older(header.version, &payload).ok_or(CodecError::Version {
             schema: M::SCHEMA,
             got: header.version,
             known: M::VERSION,
-        });
-    }
-    let payload = &bytes[Header::LEN..];
-    fits::<M>(payload.len())?;
-    let (message, consumed) = bincode::serde::decode_from_slice::<M, _>(payload, CONFIG)
-        .map_err(|e| CodecError::Payload(e.to_string()))?;
-    if consumed != payload.len() {
-        return Err(CodecError::Trailing {
-            consumed,
-            len: payload.len(),
-        });
-    }
+        })??
+    };
     check(&message)?;
     Ok((header, message))
+}
+
+/// What follows a header.
+#[derive(Debug, Clone, Copy)]
+pub struct Payload<'a>(&'a [u8]);
+
+impl Payload<'_> {
+    /// The whole of it as a `T`.
+    pub fn read<T: DeserializeOwned>(&self) -> Result<T, CodecError> {
+        let (value, consumed) = bincode::serde::decode_from_slice::<T, _>(self.0, CONFIG)
+            .map_err(|e| CodecError::Payload(e.to_string()))?;
+        if consumed == self.0.len() {
+            Ok(value)
+        } else {
+            Err(CodecError::Trailing {
+                consumed,
+                len: self.0.len(),
+            })
+        }
+    }
+
+    /// The number of the variant, of a payload that begins with an enum.
+    pub fn variant(&self) -> Option<u32> {
+        self.0.first_chunk().map(|tag| u32::from_le_bytes(*tag))
+    }
 }
 
 fn fits<M: Message>(len: usize) -> Result<(), CodecError> {

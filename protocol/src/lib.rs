@@ -43,7 +43,7 @@ mod telemetry;
 mod to_car;
 mod to_wall;
 
-pub use codec::{CodecError, decode, encode};
+pub use codec::{CodecError, Payload, decode, encode};
 pub use geometry::{Covariance, Pose2, Twist2};
 pub use header::{Header, HeaderError, Stamps};
 pub use key::{CarName, Key, KeyError, Topic};

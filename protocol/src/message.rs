@@ -3,6 +3,8 @@
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use crate::codec::{CodecError, Payload};
+
 /// A payload that can travel behind a [`Header`](crate::Header).
 pub trait Message: Serialize + DeserializeOwned {
     /// What it is.
@@ -11,6 +13,12 @@ pub trait Message: Serialize + DeserializeOwned {
     const VERSION: u16 = 1;
     /// Longest payload [bytes].
     const MAX_LEN: usize = 64 * 1024;
+
+    /// Reads a payload of an older version as the present one; None for a version that never was.
+    fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
+        let _ = (version, payload);
+        None
+    }
 
     /// Rules beyond the types: lengths and ranges. That floats are finite is checked for all messages.
     fn validate(&self) -> Result<(), Invalid> {

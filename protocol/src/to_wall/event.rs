@@ -4,7 +4,9 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Cause, CommandId, Message, Pose2, Rates, Schema, Severity, State, Value};
+use super::older_event;
+use crate::codec::Payload;
+use crate::{Cause, CodecError, CommandId, Message, Pose2, Rates, Schema, Severity, State, Value};
 
 /// Something that happened, at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -98,7 +100,7 @@ pub enum EventKind {
         /// Its name.
         name: String,
         /// What `changes` compare it with: the set of the same name that it replaces, or, for a new one, the set that was in
-        /// force, of which it keeps what was not given.
+        /// force, of which it keeps what was not given. Empty where a car of an older version did not tell.
         from: String,
         /// Every value in which the two differ.
         changes: Vec<ValueChange>,
@@ -327,6 +329,9 @@ impl fmt::Display for EventKind {
 const LISTED: usize = 8;
 
 fn tell_stored(f: &mut fmt::Formatter<'_>, name: &str, from: &str, changes: &[ValueChange]) -> fmt::Result {
+    if from.is_empty() {
+        return write!(f, "set {name} stored");
+    }
     let (stored, but) = if from == name {
         (format!("set {name} stored in place of what it was"), ": ")
     } else {
@@ -348,4 +353,8 @@ impl Message for Event {
     /// 2: what was before a new pose and new rates; whether the full-rate streams go on over a slow link.
     /// 3: the values of a stored set that differ.
     const VERSION: u16 = 3;
+
+    fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
+        older_event::read(version, payload)
+    }
 }

@@ -6,6 +6,7 @@ mod health;
 mod info;
 mod load;
 mod map;
+mod older_event;
 mod params;
 mod pose;
 mod recorded;

@@ -19,7 +19,7 @@ pub(crate) fn check(data: &[u8]) {
     // The first byte picks a message whose header is sound, so that the payload is looked at, too.
     if let Some((&pick, payload)) = data.split_first() {
         let schema = Schema::ALL[usize::from(pick) % Schema::ALL.len()];
-        let version = 1 + u16::from(pick / 128);
+        let version = 1 + u16::from(pick / 64);
         let mut bytes = Header::new(schema, version, Stamps::default())
             .to_bytes()
             .to_vec();
@@ -62,6 +62,9 @@ fn there_and_back<M: Message>(bytes: &[u8]) {
             sensor: header.sensor,
             published: header.published,
         };
+        if header.version != M::VERSION {
+            return;
+        }
         // There are no two ways to write the same, such as a bool of 2.
         assert_eq!(encode(&message, stamps).expect("was valid"), bytes);
     }

@@ -107,6 +107,74 @@ fn golden(name: &str) -> &'static str {
         .unwrap_or("missing in golden.txt")
 }
 
+/// Events as cars of versions 1 and 2 have sent them.
+#[test]
+fn events_of_older_versions_are_read() {
+    fn event(version: u16, payload: &str) -> Event {
+        let header = Header::new(Schema::Event, version, STAMPS);
+        let digits = payload.replace(' ', "");
+        let mut bytes = header.to_bytes().to_vec();
+        bytes.extend((0..digits.len()).step_by(2).map(|at| {
+            let digits = &digits[at..at + 2];
+            u8::from_str_radix(digits, 16).expect("hexadecimal digits")
+        }));
+        let (back, event) = decode::<Event>(&bytes).expect("an event");
+        assert_eq!(back, header);
+        event
+    }
+    // Update 77, by `ana`, under a command.
+    let rest = "4d00000000000000 01 0300000000000000 616e61 01 100f0e0d0c0b0a090807060504030201";
+    let stored = EventKind::SetStored {
+        name: "wet".into(),
+        from: String::new(),
+        changes: Vec::new(),
+    };
+    assert_eq!(stored.to_string(), "set wet stored");
+    let pose = "000000000000f83f 00000000000002c0 000000000000e03f";
+    let kinds = [
+        (
+            "0c000000 0000803e".to_owned(),
+            EventKind::SlipStarted { slip: 0.25 },
+        ),
+        ("06000000 0300000000000000 776574".to_owned(), stored),
+        (
+            format!("08000000 {pose}"),
+            EventKind::PoseInitialized {
+                before: None,
+                pose: samples::POSE,
+            },
+        ),
+        (
+            "10000000".to_owned(),
+            EventKind::Warning {
+                text: "telemetry rates changed; this version of the car did not say how".into(),
+            },
+        ),
+        (
+            "18000000 0000003f 00002041".to_owned(),
+            EventKind::RatesLowered {
+                transit: 0.5,
+                pose: 10.0,
+                recorded: true,
+            },
+        ),
+    ];
+    for (i, (bytes, kind)) in kinds.into_iter().enumerate() {
+        let expected = samples::event(kind);
+        assert_eq!(event(1, &format!("{bytes} {rest}")), expected);
+        // Of those, version 2 has changed the last three.
+        if i < 2 {
+            assert_eq!(event(2, &format!("{bytes} {rest}")), expected);
+        }
+    }
+    let before = EventKind::PoseInitialized {
+        before: Some(samples::POSE),
+        pose: samples::POSE,
+    };
+    let bytes = format!("08000000 01 {pose} {pose} {rest}");
+    assert_eq!(event(2, &bytes), samples::event(before));
+}
+
 macro_rules! payloads {
     ($($name:ident: $message:expr;)*) => {
         $(#[test]

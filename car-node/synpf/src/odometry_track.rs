@@ -8,7 +8,8 @@ use crate::slip_model::{Drive, SlipModel};
 use crate::{Dropped, Odometry, Stamp, Twist, YawRate};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
-/// whoever reads it sees one smooth motion in a frame of its own.
+/// whoever reads it sees one smooth motion in a frame of its own. Whether a jump was one of the car, which was carried or
+/// of which messages are missing, or only one of its odometry, which began anew, the next scan can tell.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct OdometryTrack {
     /// Poses in the smooth frame.
@@ -22,6 +23,8 @@ pub(crate) struct OdometryTrack {
     drive: Drive,
     /// Jumps taken out so far.
     pub(crate) jumps: u64,
+    /// What would bring the poses that follow the last jumps, in the smooth frame, to where they are if the car jumped.
+    leap: Option<Pose>,
 }
 
 /// As much as a late scan can need: 2 s at 200 Hz.
@@ -31,6 +34,9 @@ const KEPT: usize = 400;
 const JUMP: [f64; 2] = [0.3, 0.3];
 /// ...plus this much per second, for a twist that is wrong [m/s], [rad/s].
 const JUMP_RATE: [f64; 2] = [3.0, 3.0];
+
+/// After a gap of so long [s] the pose says where the car has gone, and not the twist, if it can have gone so far.
+const GAP: f64 = 0.5;
 
 /// A gyroscope is silent when its last reading is older than this [s].
 const GYRO_SILENT: f64 = 0.1;
@@ -76,8 +82,14 @@ impl OdometryTrack {
             step.distance(expected),
             maps::wrap_angle(step.heading - expected.heading).abs(),
         ];
-        if off[0] > JUMP[0] + JUMP_RATE[0] * dt || off[1] > JUMP[1] + JUMP_RATE[1] * dt {
+        let possible = [JUMP[0] + JUMP_RATE[0] * dt, JUMP[1] + JUMP_RATE[1] * dt];
+        let speed = last.twist.linear_x.hypot(last.twist.linear_y);
+        let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + possible[0];
+        let before = self.points.back().expect("a last message has a point").pose;
+        if (off[0] > possible[0] || off[1] > possible[1]) && !gone_on {
             self.jumps += 1;
+            let leap = before * step * (before * expected).inverse();
+            self.leap = Some(self.leap.map_or(leap, |earlier| earlier * leap));
             step = expected;
         }
         let mut arc = step.log();
@@ -98,7 +110,6 @@ impl OdometryTrack {
             ],
             self.drive,
         );
-        let before = self.points.back().expect("a last message has a point").pose;
         self.last = Some(*odometry);
         self.points.push_back(Odometry {
             pose: before * step,
@@ -131,6 +142,12 @@ impl OdometryTrack {
             self.yaw_rates.pop_front();
         }
         Ok(())
+    }
+
+    /// The jumps since this was last asked, as a motion of the smooth frame: with it in front, later poses are where they
+    /// would be if the car itself had jumped. None when there was none.
+    pub(crate) fn take_leap(&mut self) -> Option<Pose> {
+        self.leap.take()
     }
 
     /// What the car was doing at the last message.

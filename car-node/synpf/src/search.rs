@@ -73,6 +73,17 @@ pub(crate) struct Search {
     since_seeding: f64,
 }
 
+/// What a scan says to a jump of the odometry.
+#[derive(Debug, Clone)]
+pub(crate) enum AfterJump {
+    /// Only the odometry jumped.
+    Stayed,
+    /// The car is where the jump has taken it.
+    Moved(Estimate),
+    /// It may be either; a search can begin with both.
+    Unclear(Search),
+}
+
 /// How long one scan is remembered in a score [s].
 const MEMORY: f64 = 0.5;
 
@@ -174,6 +185,50 @@ impl Search {
         (best.scans >= 6 && explains(best.score) && margin >= needed).then_some(best.estimate)
     }
 
+    /// The odometry has jumped: whether the car is at `stayed`, where it would be without, or at `moved`.
+    pub(crate) fn after_jump(
+        map: &TrackMap,
+        scan: &ReadyScan,
+        [stayed, moved]: [Pose; 2],
+        parameters: &Parameters,
+    ) -> AfterJump {
+        // So little is the filter's to mend.
+        if stayed.distance(moved) < 0.1 * f64::from(NEARBY) && same_way(stayed, moved) {
+            return AfterJump::Stayed;
+        }
+        let candidate = |pose| {
+            let estimate = fitted(map, scan, pose, parameters);
+            Candidate {
+                estimate,
+                score: score(map, scan, estimate.pose),
+                scans: 1,
+            }
+        };
+        // Along its way odometry errs by a few per cent; of places that fit alike it knows best.
+        let astray = (ASTRAY * stayed.distance(moved)).clamp(0.2, 2.0);
+        let steps = (astray / 0.2) as i32;
+        let (_, moved) = (-steps..=steps)
+            .map(|step| {
+                let by = 0.2 * f64::from(step);
+                let found = candidate(moved * Pose::new(by, 0.0, 0.0));
+                (found.score - 0.5 * (by / astray).powi(2), found)
+            })
+            .max_by(|(a, _), (b, _)| a.total_cmp(b))
+            .expect("at least three");
+        let stayed = candidate(stayed);
+        // Odometry that begins anew puts the car just anywhere: hardly ever where the scan fits as well as before.
+        if explains(moved.score) && moved.score >= stayed.score {
+            AfterJump::Moved(moved.estimate)
+        } else if explains(stayed.score) && stayed.score > moved.score + parameters.search.search_margin {
+            AfterJump::Stayed
+        } else {
+            AfterJump::Unclear(Self {
+                candidates: vec![stayed, moved],
+                ..Self::default()
+            })
+        }
+    }
+
     /// Looks for a pose elsewhere that explains a scan clearly better than `pose` does; with what was found, a
     /// search can begin. `fall` says that the scan fits worse than usual.
     pub(crate) fn second_opinion(
@@ -232,6 +287,9 @@ impl Search {
 /// A pose may be wrong by this much along its heading without being another place [0.1 m].
 const NEARBY: i32 = 6;
 
+/// Odometry's share of error over a way of which nothing was seen.
+const ASTRAY: f64 = 0.05;
+
 /// Whether a score is that of a pose which explains a scan, at least in good part.
 fn explains(score: f64) -> bool {
     score > INDEPENDENT * 0.35f64.ln()
@@ -271,7 +329,11 @@ fn fitted(map: &TrackMap, scan: &ReadyScan, pose: Pose, parameters: &Parameters)
 }
 
 fn same(a: Pose, b: Pose) -> bool {
-    a.distance(b) < SAME[0] && wrap_angle(a.heading - b.heading).abs() < SAME[1]
+    a.distance(b) < SAME[0] && same_way(a, b)
+}
+
+fn same_way(a: Pose, b: Pose) -> bool {
+    wrap_angle(a.heading - b.heading).abs() < SAME[1]
 }
 
 /// Log-likelihood of a scan at a pose: the robust fit of its end points.

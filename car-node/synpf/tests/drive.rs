@@ -140,10 +140,7 @@ fn a_car_that_nobody_placed_finds_itself() {
 #[test]
 fn a_kidnapped_car_says_so_and_recovers() {
     let map = ring();
-    let mut localizer = localizer(&map, named("hq"), 4);
-    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
-    localizer.initialize(truth(0.0)).expect("finite");
-    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    let mut localizer = driven(&map, 4);
     // Somebody carries the car on by a third of the track: its pose is set where it no longer is.
     let there = truth(1.0 + common::lap() / 3.0);
     localizer.initialize(there).expect("finite");
@@ -161,13 +158,86 @@ fn a_kidnapped_car_says_so_and_recovers() {
     );
 }
 
+/// A localizer that has followed the track for a second.
+fn driven(map: &Arc<TrackMap>, seed: u64) -> Localizer {
+    let mut localizer = localizer(map, named("hq"), seed);
+    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+    localizer.initialize(truth(0.0)).expect("finite");
+    drive(&mut localizer, map, 0.02, 1.0, 1.0);
+    localizer
+}
+
+#[test]
+fn a_log_of_which_a_piece_is_missing_is_followed_on() {
+    let map = ring();
+    let earlier = |stamp: Stamp, by: f64| stamp.plus(-by);
+    for missing in [0.5, common::lap() / 3.0] {
+        // The piece is cut out and the stamps are closed up: odometry jumps as far as the car.
+        let mut localizer = driven(&map, 11);
+        let mut odom = 1.02;
+        for k in 1..60 {
+            let at = 1.0 + 0.025 * f64::from(k);
+            while odom <= at {
+                let mut message = odometry(odom + missing, 1.0);
+                message.stamp = earlier(message.stamp, missing);
+                localizer.on_odometry(&message).expect("sound");
+                odom += 0.02;
+            }
+            let mut scan = scan(&map, at + missing);
+            scan.stamp = earlier(scan.stamp, missing);
+            let update = localizer.on_scan(&scan).expect("an update");
+            if k > 1 {
+                let off = update.pose.distance(truth(at + missing));
+                assert!(
+                    update.mode == Mode::Tracking && off < 0.05,
+                    "{missing} s, {at}: {off}"
+                );
+            }
+        }
+        assert_eq!(localizer.odometry_jumps(), 1);
+    }
+}
+
+#[test]
+fn odometry_that_begins_anew_moves_no_car() {
+    let map = ring();
+    let mut localizer = driven(&map, 12);
+    let anew = odometry(1.0, 1.0).pose.inverse();
+    let mut odom = 1.02;
+    for k in 1..60 {
+        let at = 1.0 + 0.025 * f64::from(k);
+        while odom <= at {
+            let mut message = odometry(odom, 1.0);
+            message.pose = anew * message.pose;
+            localizer.on_odometry(&message).expect("sound");
+            odom += 0.02;
+        }
+        let update = localizer.on_scan(&scan(&map, at)).expect("an update");
+        assert!(
+            update.mode == Mode::Tracking && error(&update) < 0.05,
+            "{at}: {}",
+            error(&update)
+        );
+    }
+    assert_eq!(localizer.odometry_jumps(), 1);
+}
+
+#[test]
+fn seconds_without_a_message_are_caught_up_by_the_odometry() {
+    let map = ring();
+    for gap in [0.6, 2.5] {
+        let mut localizer = driven(&map, 13);
+        let updates = drive(&mut localizer, &map, 1.02 + gap, 1.5 + gap, 1.0);
+        let worst = updates.iter().map(error).fold(0.0, f64::max);
+        assert!(worst < 0.05, "after {gap} s: {worst}");
+        assert_eq!(localizer.odometry_jumps(), 0);
+    }
+}
+
 #[test]
 fn a_set_swapped_in_mid_drive_keeps_the_pose() {
     let map = ring();
-    let mut localizer = localizer(&map, named("hq"), 6);
-    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
-    localizer.initialize(truth(0.0)).expect("finite");
-    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    let mut localizer = driven(&map, 6);
     for (k, name) in ["lq", "adaptive", "hq"].into_iter().enumerate() {
         localizer.set_parameters(named(name)).expect("sound");
         let from = 1.02 + 0.5 * k as f64;
@@ -183,10 +253,7 @@ fn a_set_swapped_in_mid_drive_keeps_the_pose() {
 #[test]
 fn an_opponent_in_view_is_no_loss() {
     let map = ring();
-    let mut localizer = localizer(&map, named("hq"), 7);
-    localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
-    localizer.initialize(truth(0.0)).expect("finite");
-    drive(&mut localizer, &map, 0.02, 1.0, 1.0);
+    let mut localizer = driven(&map, 7);
     let mut odom = 1.0;
     for k in 0..120 {
         let at = 1.0 + 0.025 * f64::from(k + 1);

@@ -122,6 +122,9 @@ impl Monitor {
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.last_scan = Some(now);
         self.refused = 0;
+        // Out of STALE first: what this scan says to the pose is said with it.
+        let missing = self.missing(now);
+        self.stale_or_not(!missing.is_empty(), now);
         let mut metrics = Metrics::of(update);
         self.add_ages(&mut metrics, update.stamp, now);
         let [slow, fast] = self.smooth(Fit::of(&metrics), update.stamp);
@@ -145,30 +148,34 @@ impl Monitor {
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
         self.advance(update.mode, update.stamp, now);
-        self.tick(now)
+        self.verdict.causes = self.causes(missing);
+        &self.verdict
     }
 
     /// Looks at the clock: without data, the state becomes STALE. Also renews the causes.
     pub fn tick(&mut self, now: Stamp) -> &Verdict {
         let missing = self.missing(now);
-        let stale = self.verdict.state == State::Stale;
-        if !missing.is_empty() && !stale && self.verdict.state != State::Init {
-            self.before_stale = self.verdict.state;
-            self.enter(State::Stale, now);
-        } else if missing.is_empty() && stale {
-            // Odometry has carried a tracked pose across the gap; anything else starts again.
-            let tracked = matches!(self.before_stale, State::Localized | State::Degraded);
-            self.enter(
-                if tracked {
-                    State::Degraded
-                } else {
-                    State::Converging
-                },
-                now,
-            );
-        }
+        self.stale_or_not(!missing.is_empty(), now);
         self.verdict.causes = self.causes(missing);
         &self.verdict
+    }
+
+    /// Enters or leaves STALE.
+    fn stale_or_not(&mut self, silent: bool, now: Stamp) {
+        let stale = self.verdict.state == State::Stale;
+        if silent && !stale && self.verdict.state != State::Init {
+            self.before_stale = self.verdict.state;
+            self.enter(State::Stale, now);
+        } else if !silent && stale {
+            // Odometry has carried a tracked pose across the gap; anything else starts again.
+            let tracked = matches!(self.before_stale, State::Localized | State::Degraded);
+            let state = if tracked {
+                State::Degraded
+            } else {
+                State::Converging
+            };
+            self.enter(state, now);
+        }
     }
 
     fn enter(&mut self, state: State, now: Stamp) {
@@ -506,6 +513,15 @@ mod tests {
         assert_eq!(drive.monitor.verdict().state, State::Degraded);
         drive.drive(2.0, |update| update.alignment = 0.7);
         assert_eq!(drive.monitor.verdict().state, State::Localized);
+    }
+
+    #[test]
+    fn a_pose_given_up_at_the_first_scan_after_a_silence_is_lost_at_once() {
+        let mut drive = Drive::localized();
+        drive.now = drive.now.plus(2.0);
+        assert_eq!(drive.monitor.tick(drive.now).state, State::Stale);
+        let searching = |update: &mut Update| update.mode = Mode::Searching;
+        assert_eq!(drive.drive(SCAN, searching), [State::Stale, State::Lost]);
     }
 
     #[test]

@@ -49,8 +49,8 @@ pub use link::{DEFAULT_LISTEN, LOCAL_WALL, Link, LinkError, Role, Sink, unix_now
 pub use log::{Log, LogEntry};
 pub use program::program;
 pub use recording::{
-    Progress, Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, read_events,
-    recover,
+    Progress, Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, Unreadable,
+    UnreadableCount, read_events, recover,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -9,7 +9,7 @@ use serde::Serialize;
 use crate::board::Board;
 use crate::event::FleetEvent;
 use crate::fleet::Fleet;
-use crate::recording::{RecordingError, read_events};
+use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
 /// A recording being played.
 pub struct Replay {
@@ -17,6 +17,7 @@ pub struct Replay {
     path: PathBuf,
     /// When its first and its last event arrived [unix ns].
     span: (i64, i64),
+    unreadable: Vec<Unreadable>,
     wheel: Mutex<Wheel>,
     turned: Condvar,
 }
@@ -72,8 +73,11 @@ impl Replay {
     /// play it on a thread of its own.
     pub fn start(path: &Path) -> Result<Arc<Self>, RecordingError> {
         let mut span: Option<(i64, i64)> = None;
+        let mut unreadable = UnreadableCount::default();
         for event in read_events(path)? {
-            let at = event?.at;
+            let event = event?;
+            unreadable.take(&event);
+            let at = event.at;
             span = Some(span.map_or((at, at), |(from, to)| (from.min(at), to.max(at))));
         }
         let span = span.ok_or_else(|| RecordingError::Empty(path.display().to_string()))?;
@@ -81,6 +85,7 @@ impl Replay {
             board: Arc::default(),
             path: path.to_owned(),
             span,
+            unreadable: unreadable.list(),
             wheel: Mutex::new(Wheel {
                 playing: true,
                 speed: 1.0,
@@ -102,6 +107,11 @@ impl Replay {
     /// Where its events arrive.
     pub fn board(&self) -> &Arc<Board> {
         &self.board
+    }
+
+    /// What is in the recording and cannot be read.
+    pub fn unreadable(&self) -> &[Unreadable] {
+        &self.unreadable
     }
 
     /// The moment of the recording that is shown [unix ns].

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use pitwall::{Fleet, Happening, RecordingError, read_events};
+use pitwall::{Fleet, Happening, RecordingError, UnreadableCount, read_events};
 use protocol::{Telemetry, Topic};
 use serde_json::json;
 
@@ -34,9 +34,11 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     let head = "car,sensor_unix_ns,state,alignment,residual_m,slip,spread_along_m,spread_across_m,particles";
     let mut healths = create("health.csv", head)?;
     let mut fleet = Fleet::default();
+    let mut unreadable = UnreadableCount::default();
     let mut counts = [0_u64; 3];
     for event in &events {
         fleet.apply(event);
+        unreadable.take(event);
         let Happening::Message {
             topic,
             header,
@@ -91,9 +93,12 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
         out.flush().with_context(|| folder.display().to_string())?;
     }
     let [poses, truths, healths] = counts;
+    let unreadable = unreadable.list();
+    super::complain_of(&unreadable);
     if json {
         output::say_json(&json!({
             "folder": folder, "poses": poses, "truths": truths, "healths": healths, "laps": lap_count,
+            "unreadable": unreadable,
         }))?;
     } else {
         output::say(&format!(

@@ -15,7 +15,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pitwall::{Hub, PageOptions, Role};
+use pitwall::{Hub, PageOptions, Role, Unreadable};
 use protocol::CarName;
 
 use crate::cli::{Cli, LinkOptions, Verb};
@@ -114,6 +114,13 @@ async fn no_such_car(hub: &Hub, car: &CarName) -> ExitCode {
     output::complain(&format!("no such car: {car}; {others}"));
     hub.close().await;
     ExitCode::from(NO_SUCH_CAR)
+}
+
+/// Says what of a recording cannot be read.
+fn complain_of(unreadable: &[Unreadable]) {
+    for stream in unreadable {
+        output::complain(&stream.to_string());
+    }
 }
 
 /// Ends when the program is asked to stop.

@@ -27,8 +27,10 @@ pub(super) async fn run(
         .await
         .map_err(|error| anyhow::anyhow!("cannot serve the page at {address}: {error}"))?;
     let duration = replay.view().duration_s;
+    super::complain_of(replay.unreadable());
     if json {
-        output::say_json(&json!({"page": page.url(), "duration_s": duration}))?;
+        let unreadable = replay.unreadable();
+        output::say_json(&json!({"page": page.url(), "duration_s": duration, "unreadable": unreadable}))?;
     } else {
         output::say(&format!(
             "replay of {}, {duration:.1} s: {}\nCtrl-C ends it",

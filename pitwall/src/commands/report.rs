@@ -12,6 +12,7 @@ pub(super) fn run(file: &Path, output: Option<PathBuf>, json: bool) -> anyhow::R
     let report = Report::of(file)?;
     let to = output.unwrap_or_else(|| file.with_extension("html"));
     std::fs::write(&to, report.to_html()).with_context(|| to.display().to_string())?;
+    super::complain_of(&report.unreadable);
     if json {
         output::say_json(&report)?;
     } else {

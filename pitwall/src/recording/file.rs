@@ -385,18 +385,6 @@ pub enum RecordingError {
     /// The file is a recording of nothing.
     #[error("{0} holds no event of any car")]
     Empty(String),
-    /// A message in the file cannot be read.
-    #[error("{file}: {channel} number {sequence}: {reason}")]
-    Message {
-        /// The file.
-        file: String,
-        /// The channel.
-        channel: String,
-        /// The message's sequence number.
-        sequence: u32,
-        /// What is wrong.
-        reason: String,
-    },
 }
 
 impl RecordingError {

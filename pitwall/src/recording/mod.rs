@@ -23,8 +23,10 @@ mod note;
 mod read;
 mod recorder;
 mod recover;
+mod unreadable;
 
 pub use file::{RecordingError, StreamSummary, Summary};
 pub use read::{Recording, read_events};
 pub use recorder::{Progress, Recorder, Status};
 pub use recover::{Recovered, recover};
+pub use unreadable::{Unreadable, UnreadableCount};

@@ -1,5 +1,7 @@
-//! Reads a recording back: the same events as the live pit wall had.
+//! Reads a recording back: the same events as the live pit wall had. A message that cannot be read is an event, too
+//! ([`Happening::Unreadable`]), as it is live; a channel that is of no kind known here is passed over with a warning.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
@@ -17,6 +19,8 @@ use crate::event::{FleetEvent, Happening, Lane};
 pub struct Recording<R: Read> {
     messages: MessageReader<R>,
     path: PathBuf,
+    /// Channels that were passed over.
+    foreign: BTreeSet<String>,
 }
 
 /// Opens a recording. An unfinished one is an error at its end: [`recover`](super::recover()) it first.
@@ -25,6 +29,7 @@ pub fn read_events(path: &Path) -> Result<Recording<BufReader<File>>, RecordingE
     Ok(Recording {
         messages: MessageReader::new_with_options(BufReader::new(file), LinearReaderOptions::default()),
         path: path.to_owned(),
+        foreign: BTreeSet::new(),
     })
 }
 
@@ -53,54 +58,49 @@ impl<R: Read> Iterator for Recording<R> {
             };
             let channel = message.channel.topic.as_str();
             let at = message.log_time as i64;
-            let fault = |reason: String| RecordingError::Message {
-                file: self.path.display().to_string(),
-                channel: channel.to_owned(),
-                sequence: message.sequence,
-                reason,
+            let event = if message.channel.message_encoding == WIRE_ENCODING {
+                let key = channel.parse::<Key>().map_err(|e| e.to_string());
+                key.and_then(|key| Ok((happening(key.topic, &message.data)?, key.car)))
+            } else if let Some(car) = Note::car(channel) {
+                let note = serde_json::from_slice::<Note>(&message.data);
+                note.map(|note| (note.into(), car)).map_err(|e| e.to_string())
+            } else {
+                // For other tools.
+                continue;
             };
-            if message.channel.message_encoding == WIRE_ENCODING {
-                let event = channel
-                    .parse::<Key>()
-                    .map_err(|e| e.to_string())
-                    .and_then(|key| event_of(key, &message.data, at));
-                return Some(event.map_err(fault));
-            }
-            if let Some(car) = Note::car(channel) {
-                let note = serde_json::from_slice::<Note>(&message.data).map_err(|e| fault(e.to_string()));
-                return Some(note.map(|note| FleetEvent {
-                    at,
-                    car,
-                    happening: note.into(),
-                }));
+            match event {
+                Ok((happening, car)) => return Some(Ok(FleetEvent { at, car, happening })),
+                Err(error) => {
+                    if self.foreign.insert(channel.to_owned()) {
+                        tracing::warn!(channel, error, "passed over; was it recorded by a newer pitwall?");
+                    }
+                }
             }
         }
     }
 }
 
-fn event_of(key: Key, data: &[u8], at: i64) -> Result<FleetEvent, String> {
-    let bytes: Arc<[u8]> = data.into();
-    let happening = if key.topic == Topic::Map {
-        let (_, map) = decode::<MapReply>(data).map_err(|e| e.to_string())?;
-        Happening::Map {
+/// What a message as it came says. An error for a topic that is not recorded.
+fn happening(topic: Topic, data: &[u8]) -> Result<Happening, String> {
+    let bytes = || data.into();
+    let happening = if topic == Topic::Map {
+        decode::<MapReply>(data).map(|(_, map)| Happening::Map {
             map: Arc::new(map),
-            bytes,
-        }
+            bytes: bytes(),
+        })
     } else {
-        let (header, telemetry) = Telemetry::decode(key.topic, data)
-            .ok_or_else(|| format!("{} carries no telemetry", key.topic))?
-            .map_err(|e| e.to_string())?;
-        Happening::Message {
-            topic: key.topic,
+        let telemetry =
+            Telemetry::decode(topic, data).ok_or_else(|| format!("{topic} carries no telemetry"))?;
+        telemetry.map(|(header, telemetry)| Happening::Message {
+            topic,
             lane: Lane::Complete,
             header,
             telemetry: Box::new(telemetry),
-            bytes,
-        }
+            bytes: bytes(),
+        })
     };
-    Ok(FleetEvent {
-        at,
-        car: key.car,
-        happening,
-    })
+    Ok(happening.unwrap_or_else(|error| Happening::Unreadable {
+        topic,
+        error: error.to_string(),
+    }))
 }

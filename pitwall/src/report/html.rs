@@ -31,6 +31,9 @@ pub(super) fn page(report: &Report) -> String {
         report.duration_s,
         report.cars.len()
     ));
+    for unreadable in &report.unreadable {
+        body.push_str(&format!("<p>{}.</p>", escape(&unreadable.to_string())));
+    }
     body.push_str(&table_one(report));
     for car in &report.cars {
         body.push_str(&section(car, report.duration_s));

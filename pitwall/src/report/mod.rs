@@ -19,7 +19,7 @@ use serde::Serialize;
 use crate::event::{FleetEvent, Happening};
 use crate::fleet::Fleet;
 use crate::laps::Lap;
-use crate::recording::{RecordingError, read_events};
+use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
 /// Everything that the report says.
 #[derive(Debug, Clone, Serialize)]
@@ -32,6 +32,8 @@ pub struct Report {
     pub cars: Vec<CarReport>,
     /// Markers and what else the engineers said or did, in order.
     pub notes: Vec<String>,
+    /// What is in the recording and cannot be read.
+    pub unreadable: Vec<Unreadable>,
 }
 
 /// One car.
@@ -172,6 +174,7 @@ struct Collector {
     ticked: i64,
     series: BTreeMap<CarName, Series>,
     full_rate: BTreeMap<CarName, Vec<Spot>>,
+    unreadable: UnreadableCount,
 }
 
 impl Collector {
@@ -186,6 +189,7 @@ impl Collector {
             self.fleet.tick(self.ticked);
         }
         self.fleet.apply(event);
+        self.unreadable.take(event);
         let at_s = (event.at - from) as f64 * 1e-9;
         let series = self.series.entry(event.car.clone()).or_default();
         let Happening::Message {
@@ -295,6 +299,7 @@ impl Collector {
             duration_s: (to - from) as f64 * 1e-9,
             cars,
             notes,
+            unreadable: self.unreadable.list(),
         })
     }
 }

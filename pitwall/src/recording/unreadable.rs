@@ -1,0 +1,134 @@
+//! What of a recording cannot be read: a program of another version wrote it, or it was damaged on its way.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use protocol::{CarName, Topic};
+use serde::Serialize;
+
+use crate::event::{FleetEvent, Happening};
+
+/// Messages of one stream that cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Unreadable {
+    /// The car.
+    pub car: CarName,
+    /// The stream.
+    pub topic: Topic,
+    /// How many.
+    pub messages: u64,
+    /// What is wrong with the first of them.
+    pub error: String,
+}
+
+impl fmt::Display for Unreadable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            car,
+            topic,
+            messages,
+            error,
+        } = self;
+        let messages = match messages {
+            1 => "1 message is".to_owned(),
+            n => format!("{n} messages are"),
+        };
+        write!(
+            f,
+            "{car} {topic}: {messages} left out, which cannot be read: {error}"
+        )
+    }
+}
+
+/// Counts what cannot be read.
+#[derive(Debug, Default)]
+pub struct UnreadableCount(BTreeMap<(CarName, Topic), (u64, String)>);
+
+impl UnreadableCount {
+    /// Takes note of an event.
+    pub fn take(&mut self, event: &FleetEvent) {
+        if let Happening::Unreadable { topic, error } = &event.happening {
+            let (messages, _) = self
+                .0
+                .entry((event.car.clone(), *topic))
+                .or_insert_with(|| (0, error.clone()));
+            *messages += 1;
+        }
+    }
+
+    /// What there was, by stream.
+    pub fn list(&self) -> Vec<Unreadable> {
+        let of = |((car, topic), (messages, error)): (&(CarName, Topic), &(u64, String))| Unreadable {
+            car: car.clone(),
+            topic: *topic,
+            messages: *messages,
+            error: error.clone(),
+        };
+        self.0.iter().map(of).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::file::RecordingFile;
+    use crate::{Lane, Replay, Report, read_events};
+    use protocol::{Event, EventKind, Stamps, Telemetry, encode};
+    use std::sync::Arc;
+
+    fn event(number: u64, version: u16) -> FleetEvent {
+        let event = Event {
+            kind: EventKind::SearchStarted,
+            update: number,
+            who: None,
+            command: None,
+        };
+        let stamps = Stamps {
+            session: 1,
+            sequence: number,
+            ..Stamps::default()
+        };
+        let mut bytes = encode(&event, stamps).expect("a good message");
+        let (header, _) = protocol::decode::<Event>(&bytes).expect("our own");
+        // Behind the magic and the schema.
+        bytes[6..8].copy_from_slice(&version.to_le_bytes());
+        FleetEvent {
+            at: 1_000_000_000 + number as i64,
+            car: "car-1".parse().expect("a name"),
+            happening: Happening::Message {
+                topic: Topic::Event,
+                lane: Lane::Complete,
+                header,
+                telemetry: Box::new(Telemetry::Event(event)),
+                bytes: bytes.into(),
+            },
+        }
+    }
+
+    #[test]
+    fn messages_of_another_version_are_left_out_and_told() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("session.mcap");
+        let file = std::fs::File::create(&path).expect("a file");
+        let mut recording = RecordingFile::new(file).expect("begun");
+        for (number, version) in [(1, 1), (2, 99), (3, 2), (4, 99), (5, 3)] {
+            recording.write(&event(number, version)).expect("written");
+        }
+        recording.finish().expect("ended");
+
+        let read: Vec<_> = read_events(&path)
+            .expect("opens")
+            .map(|event| matches!(event.expect("goes on").happening, Happening::Message { .. }))
+            .collect();
+        assert_eq!(read, [true, false, true, false, true]);
+        let report = Report::of(&path).expect("a report");
+        let told: Vec<_> = report.unreadable.iter().map(ToString::to_string).collect();
+        let expected = "car-1 event: 2 messages are left out, which cannot be read: Event has version 99, this program \
+                        reads version 3: update the older side";
+        assert_eq!(told, [expected]);
+        assert!(report.to_html().contains(expected));
+        let replay: Arc<Replay> = Replay::start(&path).expect("it plays");
+        assert_eq!(replay.unreadable(), report.unreadable);
+        replay.stop();
+    }
+}

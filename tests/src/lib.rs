@@ -1,5 +1,6 @@
 //! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
-//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, the processor time that the host takes away, and waiting for conditions.
+//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, the processor time that the host takes
+//! away, and waiting for conditions.
 
 #[cfg(feature = "browser")]
 mod browser;

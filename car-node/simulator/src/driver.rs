@@ -125,7 +125,7 @@ const MOST_TRIM: f64 = 0.05;
 /// Further off the line [m] the servo is not what is wrong.
 const NEAR: f64 = 0.1;
 /// Slowed down behind a car ahead so hard [m/s^2]: what taped tyres have left in a bend.
-const BRAKE_BEHIND: f64 = 2.0;
+pub(crate) const BRAKE_BEHIND: f64 = 2.0;
 /// More room is left to a car that stands [m], none more to one that moves so fast [m/s].
 const BACKING_UP: f64 = 0.8;
 const SPEED_OF_TRAFFIC: f64 = 2.0;

@@ -7,7 +7,7 @@ use maps::{Pose, TrackPosition};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
 
-use crate::driver::Ahead;
+use crate::driver::{Ahead, BRAKE_BEHIND};
 use crate::vehicle::outline;
 use crate::{
     Controls, Driver, DriverParams, Estimate, Grip, Gyro, Lidar, LidarParams, Manoeuvre, Motion, Obstacle,
@@ -31,6 +31,13 @@ const IN_VIEW: f64 = 16.0;
 
 /// How long the marshals take to put a crashed car back.
 const MARSHALS: Duration = Duration::from_secs(3);
+
+/// How far back along the line they look for a place where no car is or comes to [m], in such steps [m], with so much room
+/// before and behind it [m], and for how long before they put the car where it left the line all the same.
+const LOOK_BACK: f64 = 5.0;
+const LOOK_STEP: f64 = 0.25;
+const ROOM: f64 = 0.3;
+const PATIENCE: Duration = Duration::from_secs(10);
 
 /// A car as it comes to the track.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -321,14 +328,41 @@ impl World {
             .min_by(|a, b| a.gap.total_cmp(&b.gap))
     }
 
+    /// Where along the line the marshals put a car back now; None while they do not have it, or have it still. Not beyond the
+    /// start line, which it would cross twice.
+    fn place_for(&self, index: usize, now: Duration) -> Option<f64> {
+        let car = &self.cars[index];
+        let until = car.marshals.filter(|until| now >= *until)?;
+        (0..=(LOOK_BACK / LOOK_STEP) as u32)
+            .map(|step| car.track.s - LOOK_STEP * f64::from(step))
+            .take_while(|s| *s >= 0.0)
+            .find(|s| self.is_free(index, *s))
+            .or_else(|| (now >= until + PATIENCE).then_some(car.track.s))
+    }
+
+    /// Whether a car at rest there has room, and whoever comes from behind can stop.
+    fn is_free(&self, index: usize, s: f64) -> bool {
+        let room = self.cars[index].vehicle.params().body[0] + ROOM;
+        self.cars
+            .iter()
+            .enumerate()
+            .filter(|&(other, _)| other != index)
+            .all(|(_, other)| {
+                let way = self.track.raceline.advance(other.track.s, s);
+                let stopping = other.vehicle.state().vx.max(0.0).powi(2) / (2.0 * BRAKE_BEHIND);
+                way < -room || way > room + stopping
+            })
+    }
+
     /// Driver, dynamics, walls and lap counting of one car.
     fn move_car(&mut self, index: usize, ahead: Option<Ahead>, [from, to]: [Duration; 2]) {
+        let put_back = self.place_for(index, to);
         let line = &self.track.raceline;
         let car = &mut self.cars[index];
         let mut seen = Vec::new();
-        if let Some(until) = car.marshals {
-            if to >= until {
-                let start = line.at(car.track.s);
+        if car.marshals.is_some() {
+            if let Some(s) = put_back {
+                let start = line.at(s);
                 let pose = Pose::new(start.x, start.y, start.heading);
                 car.vehicle.place(pose);
                 car.driver.reset();
@@ -675,6 +709,88 @@ mod tests {
         assert_eq!(told, [1, 1]);
         let boxes = [0, 1].map(|i| obstacle(&world.cars[i].vehicle));
         assert!(overlap(&boxes).is_none());
+    }
+
+    /// Cars that stand on the line, the first crashed: when the marshals put it back, and where along the line.
+    fn put_back(starts: &[f64]) -> (Duration, f64) {
+        let mut world = cars(starts, &vec![1.0; starts.len()]);
+        for car in &mut world.cars {
+            car.guidance = Guidance::Estimate;
+        }
+        // Off the line, so that there may be a car beside it.
+        let beside = world.truth(0).pose * Pose::new(0.0, 0.5, 0.0);
+        world.cars[0].vehicle.place(beside);
+        world.cars[0].crash(Duration::ZERO);
+        let mut placed = None;
+        while world.now() < MARSHALS + PATIENCE + Duration::from_secs(1) {
+            for output in world.step() {
+                match output.message {
+                    Message::Placed(pose) => {
+                        let s = world.track.raceline.project([pose.x, pose.y]).s;
+                        assert_eq!(placed.replace((output.at, s)), None);
+                    }
+                    Message::Collision(_) => assert!(output.at >= MARSHALS + PATIENCE, "{output:?}"),
+                    _ => {}
+                }
+            }
+        }
+        placed.expect("nobody waits for ever")
+    }
+
+    #[test]
+    fn the_marshals_put_a_car_where_there_is_room() {
+        let (at, s) = put_back(&[8.0]);
+        assert!(at == MARSHALS && (s - 8.0).abs() < 0.1, "{at:?}, {s} m");
+        // Two cars beside it: behind both.
+        let (at, s) = put_back(&[8.0, 8.0, 7.0]);
+        assert!(at == MARSHALS && (5.9..6.3).contains(&s), "{at:?}, {s} m");
+        // A queue of 6 m.
+        let queue: Vec<f64> = (0..9).map(|car| 8.0 - 0.7 * f64::from(car)).collect();
+        let (at, s) = put_back(&[&[8.0], &queue[..]].concat());
+        assert!(
+            at == MARSHALS + PATIENCE && (s - 8.0).abs() < 0.1,
+            "{at:?}, {s} m"
+        );
+    }
+
+    #[test]
+    fn the_marshals_put_nothing_before_a_car_that_cannot_stop() {
+        let mut world = cars(&[8.0, 4.0], &[1.0, 1.0]);
+        world.cars[0].marshals = Some(Duration::ZERO);
+        let mut place = |speed: f64| {
+            world.cars[1].vehicle.state_mut().vx = speed;
+            world.place_for(0, TICK)
+        };
+        assert_eq!(place(0.0), Some(8.0));
+        // From 3.5 m/s it takes 3.1 m, from 4 m/s 4 m: then behind it.
+        assert_eq!(place(3.5), Some(8.0));
+        assert!(place(4.0) < Some(4.0 - ROOM));
+    }
+
+    #[test]
+    fn traffic_is_not_hit_by_cars_that_the_marshals_put_back() {
+        let starts: Vec<f64> = (0..8).map(|car| -4.0 - 3.0 * f64::from(car)).collect();
+        let mut world = cars(&starts, &[1.0; 8]);
+        let (mut crashed, mut placed) = (0, 0);
+        while crashed < 8 || placed < 8 {
+            let now = world.now();
+            assert!(now < Duration::from_mins(1), "{placed} of {crashed} put back");
+            // Every other second another one leaves the line, to the left or to the right.
+            if crashed < 8 && now >= Duration::from_secs(10 + 2 * crashed) {
+                let car = &mut world.cars[crashed as usize * 3 % 8];
+                let side = if crashed.is_multiple_of(2) { 0.4 } else { -0.4 };
+                car.vehicle.place(car.vehicle.pose() * Pose::new(0.0, side, 0.3));
+                car.crash(now);
+                crashed += 1;
+            }
+            for output in world.step() {
+                match output.message {
+                    Message::Placed(_) => placed += 1,
+                    Message::Collision(_) => panic!("{now:?}: {output:?}"),
+                    _ => {}
+                }
+            }
+        }
     }
 
     #[test]

@@ -5,7 +5,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
+use pitwall::Replay;
 use protocol::{CarName, Pose2, Rates};
+
+use crate::link::endpoint;
 
 /// The pit wall: how well every car is localized and why. Without a command it serves the page.
 #[derive(Debug, Parser)]
@@ -53,10 +56,10 @@ Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 
 #[derive(Debug, Args)]
 pub(crate) struct LinkOptions {
     /// Listen for cars here, as tcp/ADDRESS:PORT; may be given several times.
-    #[arg(long, global = true, value_name = "ENDPOINT")]
+    #[arg(long, global = true, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) listen: Vec<String>,
     /// Join a running pit wall or router there.
-    #[arg(long, global = true, value_name = "ENDPOINT", conflicts_with = "listen")]
+    #[arg(long, global = true, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
     /// Your name, as the cars and the others at the pit wall see it; $USER unless given.
     #[arg(long, global = true, value_name = "NAME")]
@@ -150,7 +153,7 @@ pub(crate) enum Verb {
         /// The recording.
         file: PathBuf,
         /// Times real time, 0.1 to 50.
-        #[arg(long, default_value_t = 1.0)]
+        #[arg(long, default_value = "1", value_parser = speed)]
         speed: f64,
         /// Begin here, as 90s or 5m.
         #[arg(long, value_name = "TIME", default_value = "0s", value_parser = duration)]
@@ -303,6 +306,16 @@ fn duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * scale).map_err(|error| format!("{text:?}: {error}"))
 }
 
+fn speed(text: &str) -> Result<f64, String> {
+    let speed: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    let allowed = Replay::SPEEDS;
+    if allowed.contains(&speed) {
+        Ok(speed)
+    } else {
+        Err(format!("a speed is {} to {}", allowed.start(), allowed.end()))
+    }
+}
+
 fn on_off(text: &str) -> Result<bool, String> {
     match text {
         "on" => Ok(true),
@@ -350,6 +363,22 @@ mod tests {
         assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
         for text in ["", "s", "-1s", "1y", "NaN"] {
             assert!(duration(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn an_endpoint_is_a_way_to_somewhere() {
+        assert_eq!(endpoint("tcp/10.0.0.2:7447").as_deref(), Ok("tcp/10.0.0.2:7447"));
+        for text in ["", "10.0.0.2:7447", "nonsense"] {
+            assert!(endpoint(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_replay_goes_no_faster_than_it_can() {
+        assert_eq!(speed("0.5"), Ok(0.5));
+        for text in ["0", "51", "NaN", "-1", "fast"] {
+            assert!(speed(text).is_err(), "{text}");
         }
     }
 

@@ -13,6 +13,7 @@ use crossbeam_channel::{Receiver, Sender, select};
 use protocol::{CarName, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
+use zenoh::config::EndPoint;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::{Sample, SampleKind};
@@ -104,7 +105,7 @@ impl Role {
             config.insert_json5(key, &value).map_err(|e| LinkError::Config {
                 key,
                 value,
-                reason: e.to_string(),
+                reason: reason(&e),
             })?;
         }
         Ok(config)
@@ -118,6 +119,28 @@ impl std::fmt::Display for Role {
             Self::Client { connect } => write!(f, "joined the pit wall at {}", connect.join(", ")),
         }
     }
+}
+
+/// An endpoint as people type it, or what is wrong with it.
+pub(crate) fn endpoint(text: &str) -> Result<String, String> {
+    text.parse::<EndPoint>()
+        .map(|endpoint| endpoint.to_string())
+        .map_err(|_| "say PROTOCOL/ADDRESS:PORT, as in tcp/192.168.1.10:7447".to_owned())
+}
+
+/// What zenoh says, without the places in its source.
+fn reason(error: &zenoh::Error) -> String {
+    let text = error.to_string();
+    let mut said = String::new();
+    let mut rest = text.as_str();
+    while let Some((before, place)) = rest.split_once(" at /")
+        && let Some((_, after)) = place.split_once(".rs:")
+    {
+        said += before;
+        let after = after.trim_start_matches(|c: char| c.is_ascii_digit());
+        rest = after.strip_prefix('.').unwrap_or(after);
+    }
+    said + rest
 }
 
 /// True when something accepts connections at a `tcp/` endpoint.
@@ -160,7 +183,7 @@ impl Link {
     pub async fn open(role: &Role, sink: Sink) -> Result<Self, LinkError> {
         let session = zenoh::open(role.config()?).await.map_err(|e| LinkError::Open {
             role: role.clone(),
-            reason: e.to_string(),
+            reason: reason(&e),
         })?;
         let (arrivals, queue) = crossbeam_channel::bounded(QUEUE);
         let (answers, answered) = crossbeam_channel::unbounded();
@@ -574,7 +597,27 @@ impl LinkError {
     fn subscribe(key: &str, error: &zenoh::Error) -> Self {
         Self::Subscribe {
             key: key.to_owned(),
-            reason: error.to_string(),
+            reason: reason(error),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_in_source_are_left_out() {
+        let error = |text: &'static str| -> zenoh::Error { text.into() };
+        for (said, told) in [
+            (
+                "no listener: [in use at /a/b.rs:61.] at /c/d.rs:338.",
+                "no listener: [in use]",
+            ),
+            ("Timeout! at /a/b.rs:7", "Timeout!"),
+            ("looked at /etc", "looked at /etc"),
+        ] {
+            assert_eq!(reason(&error(said)), told);
         }
     }
 }

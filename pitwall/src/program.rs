@@ -1,11 +1,12 @@
 //! The program: what `main` does, in the library so that a test can run it as a process of its own.
 
+use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use clap::Parser;
 use tracing_subscriber::EnvFilter;
 
-use crate::{cli, commands, output};
+use crate::{RecordingError, StartError, cli, commands, output};
 
 /// Reads the command line and does what it says, until the end or until interrupted.
 pub fn program() -> ExitCode {
@@ -33,6 +34,37 @@ pub fn program() -> ExitCode {
         .and_then(|runtime| runtime.block_on(commands::run(cli)));
     outcome.unwrap_or_else(|error| {
         output::complain(&format!("{error:#}"));
-        ExitCode::FAILURE
+        if bad_usage(&error) {
+            ExitCode::from(BAD_USAGE)
+        } else {
+            ExitCode::FAILURE
+        }
+    })
+}
+
+/// Exit code: the command line asks for what cannot be.
+const BAD_USAGE: u8 = 2;
+
+/// True when a file that was named is not there, is there already, or is none of its kind.
+fn bad_usage(error: &anyhow::Error) -> bool {
+    let by_system = |kind: ErrorKind| {
+        use ErrorKind::{AlreadyExists, IsADirectory, NotADirectory, NotFound, PermissionDenied};
+        matches!(
+            kind,
+            AlreadyExists | IsADirectory | NotADirectory | NotFound | PermissionDenied
+        )
+    };
+    let recording = |error: &RecordingError| match error {
+        RecordingError::Exists(_) | RecordingError::Foreign(_) | RecordingError::Empty(_) => true,
+        RecordingError::Io { reason, .. } => by_system(reason.kind()),
+        RecordingError::Mcap { .. } | RecordingError::Broken { .. } | RecordingError::Nothing { .. } => false,
+    };
+    error.chain().any(|cause| {
+        cause.is::<commands::BadUsage>()
+            || cause
+                .downcast_ref()
+                .is_some_and(|error: &std::io::Error| by_system(error.kind()))
+            || cause.downcast_ref().is_some_and(recording)
+            || matches!(cause.downcast_ref(), Some(StartError::File(error)) if recording(error))
     })
 }

@@ -28,9 +28,9 @@ impl PitWall {
         let hub = Hub::open(&options.role).await?;
         match Page::serve(hub.clone(), options.page).await {
             Ok(page) => Ok(Self { hub, page }),
-            Err(source) => {
+            Err(reason) => {
                 hub.close().await;
-                Err(WallError::Page { address, source })
+                Err(WallError::Page { address, reason })
             }
         }
     }
@@ -59,11 +59,11 @@ pub enum WallError {
     #[error(transparent)]
     Link(#[from] LinkError),
     /// The page.
-    #[error("cannot serve the page at {address}: {source}")]
+    #[error("cannot serve the page at {address}: {reason}")]
     Page {
         /// Where.
         address: std::net::SocketAddr,
         /// What the system says.
-        source: std::io::Error,
+        reason: std::io::Error,
     },
 }

@@ -26,7 +26,10 @@ async fn a_car_shows_up_and_is_blind_when_it_leaves() {
         })
     })
     .await;
-    assert!(hub.fleet().car(&name).is_some_and(|car| car.map.is_some()));
+    wait_until("its map", || {
+        hub.fleet().car(&name).is_some_and(|car| car.map.is_some())
+    })
+    .await;
     car.leave().await;
     wait_until("the car is blind", || {
         view().is_some_and(|car| car.state == "BLIND" && !car.alive)

@@ -112,6 +112,7 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
     let good = file("mine.yaml", "sigma_hit: 0.12\n");
     let bad = file("bad.yaml", "sigma_hit: -1\nno_such_thing: 3\n");
     let broken = file("broken.yaml", "sigma_hit: [\n");
+    let empty = file("empty.yaml", "");
     let missing = folder.path().join("nowhere.yaml");
     let missing = missing.to_str().expect("UTF-8");
     // In this order: later lines build on the earlier.
@@ -155,8 +156,23 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
             3,
             &["sigma_hit", "no_such_thing", "nothing has changed"],
         ),
-        (&["params", "car-1", "put", &broken], 1, &["broken.yaml"]),
-        (&["params", "car-1", "put", missing], 1, &["nowhere.yaml"]),
+        (
+            &["params", "car-1", "put", &broken],
+            2,
+            &["broken.yaml", "line 1"],
+        ),
+        (&["params", "car-1", "put", missing], 2, &["nowhere.yaml"]),
+        (
+            &["params", "car-1", "put", &empty],
+            2,
+            &["empty.yaml", "no parameter"],
+        ),
+        (&["record", "-o", &good], 2, &["mine.yaml exists already"]),
+        (&["replay", missing], 2, &["nowhere.yaml"]),
+        (&["replay", &good, "--speed", "51"], 2, &["0.1 to 50"]),
+        (&["report", &good], 2, &["mine.yaml is no recording"]),
+        (&["export", &empty], 2, &["empty.yaml is no recording"]),
+        (&["recover", missing], 2, &["nowhere.yaml"]),
         (&["params", "car-1", "slect", "hq"], 2, &["slect"]),
         (&["params", "Car 1"], 2, &["Car 1"]),
         (&["params", "ghost", "select", "hq"], 4, &["ghost", "car-1"]),

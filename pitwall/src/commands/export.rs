@@ -10,6 +10,7 @@ use pitwall::{Fleet, Happening, RecordingError, UnreadableCount, read_events};
 use protocol::{Telemetry, Topic};
 use serde_json::json;
 
+use super::BadUsage;
 use crate::output;
 
 pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
@@ -19,7 +20,11 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     if events.is_empty() {
         return Err(RecordingError::Empty(file.display().to_string()).into());
     }
-    fs::create_dir(&folder).with_context(|| format!("{}: nothing is overwritten", folder.display()))?;
+    if folder.exists() {
+        let folder = folder.display();
+        return Err(BadUsage(format!("{folder} exists already; nothing is overwritten")).into());
+    }
+    fs::create_dir(&folder).with_context(|| folder.display().to_string())?;
     let create = |name: &str, head: &str| -> anyhow::Result<BufWriter<File>> {
         let path = folder.join(name);
         let mut out = BufWriter::new(File::create_new(&path).with_context(|| path.display().to_string())?);

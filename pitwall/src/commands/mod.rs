@@ -27,6 +27,11 @@ const FIND: Duration = Duration::from_secs(3);
 /// Exit code: no car of that name.
 const NO_SUCH_CAR: u8 = 4;
 
+/// What was asked for cannot be: the program ends with exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct BadUsage(String);
+
 /// Does what the command line says.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     let Cli {

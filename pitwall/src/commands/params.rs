@@ -5,14 +5,13 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
 use protocol::{
     Action, CarName, Comparison, Fitness, ParameterSet, Params, ParamsAction, Reply, Shadow, StoredSet, Value,
 };
 use serde::Deserialize;
 
 use super::steer::{give, reply, tell};
-use super::{FIND, no_such_car, open};
+use super::{BadUsage, FIND, no_such_car, open};
 use crate::cli::{LinkOptions, ParamsVerb};
 use crate::output;
 
@@ -28,7 +27,10 @@ pub(super) async fn run(
     verb: Option<ParamsVerb>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let millis = |time: Duration| u32::try_from(time.as_millis()).context("--revert-after is too long");
+    let millis = |time: Duration| {
+        let fault = |_| BadUsage("--revert-after: that is too long".to_owned());
+        u32::try_from(time.as_millis()).map_err(fault)
+    };
     let (action, expect) = match verb {
         None | Some(ParamsVerb::Get) => return get(link, car, json).await,
         Some(ParamsVerb::List) => return list(link, car, None, json).await,
@@ -303,14 +305,18 @@ enum Scalar {
 }
 
 /// Reads a set from a YAML or JSON file.
-fn read_set(file: &Path, name: Option<String>) -> anyhow::Result<ParameterSet> {
-    let shown = file.display();
-    let text = std::fs::read_to_string(file).with_context(|| format!("{shown}"))?;
-    let Some(name) = name.or_else(|| Some(file.file_stem()?.to_str()?.to_owned())) else {
-        bail!("{shown}: give the set a --name");
-    };
-    let scalars: BTreeMap<String, Scalar> =
-        serde_saphyr::from_str(&text).map_err(|error| anyhow::anyhow!("{shown}: {error}"))?;
+fn read_set(file: &Path, name: Option<String>) -> Result<ParameterSet, BadUsage> {
+    let fault = |fault: &dyn std::fmt::Display| BadUsage(format!("{}: {fault}", file.display()));
+    let text = std::fs::read_to_string(file).map_err(|error| fault(&error))?;
+    let name = name
+        .or_else(|| Some(file.file_stem()?.to_str()?.to_owned()))
+        .ok_or_else(|| fault(&"give the set a --name"))?;
+    let scalars: BTreeMap<String, Scalar> = serde_saphyr::from_str(&text).map_err(|error| fault(&error))?;
+    if scalars.is_empty() {
+        return Err(fault(
+            &"it names no parameter; write `parameter: value`, one a line",
+        ));
+    }
     let values = scalars
         .into_iter()
         .map(|(name, scalar)| {
@@ -356,9 +362,16 @@ mod tests {
     fn a_bad_file_is_named() {
         let folder = tempfile::tempdir().expect("a folder");
         let file = folder.path().join("wet.yaml");
-        std::fs::write(&file, "sigma_hit: [1, 2]\n").expect("written");
-        let error = read_set(&file, None).expect_err("a list is no value");
-        assert!(error.to_string().contains("wet.yaml"), "{error}");
+        for (text, told) in [
+            ("sigma_hit: 0.1\nz_hit: [1, 2]\n", "line 2"),
+            ("sigma_hit: 0.1\nz_hit:\n", "line 2"),
+            ("sigma_hit: [\n", "line 1"),
+            ("# nothing\n", "it names no parameter"),
+        ] {
+            std::fs::write(&file, text).expect("written");
+            let error = read_set(&file, None).expect_err(text).to_string();
+            assert!(error.contains("wet.yaml") && error.contains(told), "{error}");
+        }
     }
 
     #[test]

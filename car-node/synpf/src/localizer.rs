@@ -17,7 +17,7 @@ use crate::particles::{Belief, Particles};
 use crate::quality::Quality;
 use crate::recovery::Doubt;
 use crate::refine::{Estimate, fit, refine, wall_offset};
-use crate::search::{AfterJump, INDEPENDENT, Search, fit_of};
+use crate::search::{INDEPENDENT, Search, fit_of};
 use crate::slip::{Slip, SlipWindow};
 use crate::slip_model::SlipModel;
 use crate::surprise::Surprise;
@@ -385,13 +385,18 @@ impl Localizer {
         match self.mode {
             Mode::Uninitialized => return Err(Dropped::NotInitialized),
             Mode::Tracking => {
-                if let Some(leap) = leap.filter(|_| self.parameters.recovery.recover) {
-                    let stayed = self.estimate.pose * motion;
-                    let moved = self.estimate.pose * (leap * odom).since(odom_before);
-                    if let Some(update) = self.judge_jump([stayed, moved], scan.stamp, twist) {
-                        self.at = Some((scan.stamp, odom));
-                        return Ok(update);
-                    }
+                let moved = leap.filter(|_| self.parameters.recovery.recover).map(|leap| {
+                    let from = self.estimate.pose;
+                    [from * motion, from * (leap * odom).since(odom_before)]
+                });
+                if let Some(poses) = moved
+                    && let Some(search) = Search::after_jump(&self.map, &self.scan, poses, &self.parameters)
+                {
+                    self.relocalize();
+                    self.search = search;
+                    self.estimate.pose = poses[0];
+                    self.at = Some((scan.stamp, odom));
+                    return Ok(self.report(scan.stamp, twist, None, Pose::IDENTITY));
                 }
             }
             Mode::Searching => {
@@ -400,7 +405,8 @@ impl Localizer {
                     .search
                     .update(&self.map, &self.scan, motion, seconds, &self.parameters);
                 if let Some(estimate) = found {
-                    self.start(estimate, [0.1, 0.1, 0.05]);
+                    let spread = |i: usize, least: f64| estimate.covariance[(i, i)].sqrt().max(least);
+                    self.start(estimate, [spread(0, 0.1), spread(1, 0.1), spread(2, 0.05)]);
                     return Ok(self.report(scan.stamp, twist, None, Pose::IDENTITY));
                 }
                 if let Some(best) = self.search.candidates.first() {
@@ -412,19 +418,6 @@ impl Localizer {
         let update = self.follow(scan.stamp, seconds, motion, twist);
         self.at = Some((scan.stamp, odom));
         Ok(update)
-    }
-
-    /// The odometry has jumped, and the car is at one of two poses. None when it is where it would be without.
-    fn judge_jump(&mut self, [stayed, moved]: [Pose; 2], stamp: Stamp, twist: Twist) -> Option<Update> {
-        match Search::after_jump(&self.map, &self.scan, [stayed, moved], &self.parameters) {
-            AfterJump::Stayed => return None,
-            AfterJump::Moved(estimate) => self.start(estimate, [0.1, 0.1, 0.05]),
-            AfterJump::Unclear(search) => {
-                self.relocalize();
-                self.search = search;
-            }
-        }
-        Some(self.report(stamp, twist, None, moved.since(stayed)))
     }
 
     /// One update of the pose that is followed.

@@ -60,8 +60,27 @@ pub(crate) struct Candidate {
     pub(crate) estimate: Estimate,
     /// Log-likelihood of a scan, averaged over the last ones.
     pub(crate) score: f64,
+    /// What speaks for it beside the scans, in the same units.
+    favour: f64,
     /// Scans that it has explained.
     scans: u32,
+}
+
+impl Candidate {
+    /// A candidate from one scan alone.
+    fn new(map: &TrackMap, scan: &ReadyScan, estimate: Estimate) -> Self {
+        Self {
+            estimate,
+            score: score(map, scan, estimate.pose),
+            favour: 0.0,
+            scans: 1,
+        }
+    }
+
+    /// All that speaks for it.
+    fn merit(&self) -> f64 {
+        self.score + self.favour
+    }
 }
 
 /// A search under way.
@@ -71,17 +90,6 @@ pub(crate) struct Search {
     pub(crate) candidates: Vec<Candidate>,
     driven: f64,
     since_seeding: f64,
-}
-
-/// What a scan says to a jump of the odometry.
-#[derive(Debug, Clone)]
-pub(crate) enum AfterJump {
-    /// Only the odometry jumped.
-    Stayed,
-    /// The car is where the jump has taken it.
-    Moved(Estimate),
-    /// It may be either; a search can begin with both.
-    Unclear(Search),
 }
 
 /// How long one scan is remembered in a score [s].
@@ -149,11 +157,11 @@ impl Search {
 
     /// Best first, without doubles and the hopeless.
     fn rank(&mut self, most: usize) {
-        self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-        let best = self.candidates.first().map_or(0.0, |candidate| candidate.score);
+        self.candidates.sort_by(|a, b| b.merit().total_cmp(&a.merit()));
+        let best = self.candidates.first().map_or(0.0, Candidate::merit);
         let mut kept: Vec<Candidate> = Vec::with_capacity(most);
         for candidate in &self.candidates {
-            if kept.len() == most || candidate.score < best - HOPELESS {
+            if kept.len() == most || candidate.merit() < best - HOPELESS {
                 break;
             }
             let pose = candidate.estimate.pose;
@@ -174,7 +182,7 @@ impl Search {
         let margin = self
             .candidates
             .get(1)
-            .map_or(f64::INFINITY, |second| best.score - second.score);
+            .map_or(f64::INFINITY, |second| best.merit() - second.merit());
         // A car that stands still is believed when there is no doubt at all.
         let moved = self.driven >= parameters.search.search_distance;
         let needed = if moved {
@@ -185,48 +193,49 @@ impl Search {
         (best.scans >= 6 && explains(best.score) && margin >= needed).then_some(best.estimate)
     }
 
-    /// The odometry has jumped: whether the car is at `stayed`, where it would be without, or at `moved`.
+    /// The odometry has jumped, and the car is at `stayed`, where it would be without, or at `moved`, where it was carried,
+    /// or where it drove while messages were missing. None when it stayed; else a search has begun with both.
     pub(crate) fn after_jump(
         map: &TrackMap,
         scan: &ReadyScan,
         [stayed, moved]: [Pose; 2],
         parameters: &Parameters,
-    ) -> AfterJump {
+    ) -> Option<Self> {
         // So little is the filter's to mend.
         if stayed.distance(moved) < 0.1 * f64::from(NEARBY) && same_way(stayed, moved) {
-            return AfterJump::Stayed;
+            return None;
         }
-        let candidate = |pose| {
-            let estimate = fitted(map, scan, pose, parameters);
-            Candidate {
-                estimate,
-                score: score(map, scan, estimate.pose),
-                scans: 1,
-            }
-        };
-        // Along its way odometry errs by a few per cent; of places that fit alike it knows best.
-        let astray = (ASTRAY * stayed.distance(moved)).clamp(0.2, 2.0);
-        let steps = (astray / 0.2) as i32;
-        let (_, moved) = (-steps..=steps)
-            .map(|step| {
-                let by = 0.2 * f64::from(step);
-                let found = candidate(moved * Pose::new(by, 0.0, 0.0));
-                (found.score - 0.5 * (by / astray).powi(2), found)
+        let candidate = |pose| Candidate::new(map, scan, fitted(map, scan, pose, parameters));
+        // Odometry errs by a few per cent of its way, and turns; of places that fit alike it knows best.
+        let astray = (ASTRAY * stayed.distance(moved)).clamp(STEP, 10.0 * STEP);
+        let steps = (astray / STEP) as i32;
+        let starts: Vec<_> = (-steps..=steps)
+            .flat_map(|on| (0..9).map(move |k| [on, k % 3 - 1, k / 3 - 1].map(f64::from)))
+            .map(|[on, left, turn]| Pose::new(STEP * on, STEP * left, TURN * turn))
+            .collect();
+        let (_, mut moved) = starts
+            .into_par_iter()
+            .map(|by| {
+                let found = candidate(moved * by);
+                (found.score - 0.5 * (by.x.hypot(by.y) / astray).powi(2), found)
             })
             .max_by(|(a, _), (b, _)| a.total_cmp(b))
-            .expect("at least three");
+            .expect("at least one");
         let stayed = candidate(stayed);
-        // Odometry that begins anew puts the car just anywhere: hardly ever where the scan fits as well as before.
-        if explains(moved.score) && moved.score >= stayed.score {
-            AfterJump::Moved(moved.estimate)
-        } else if explains(stayed.score) && stayed.score > moved.score + parameters.search.search_margin {
-            AfterJump::Stayed
-        } else {
-            AfterJump::Unclear(Self {
-                candidates: vec![stayed, moved],
-                ..Self::default()
-            })
+        if explains(stayed.score) && stayed.score > moved.score + parameters.search.search_margin {
+            return None;
         }
+        let mut search = Self::default();
+        if explains(moved.score) && moved.score >= stayed.score {
+            moved.favour = FAVOUR * parameters.search.search_margin;
+            moved.estimate.covariance +=
+                Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, 0.0)) * astray.powi(2);
+        } else {
+            // Perhaps it is neither.
+            search.since_seeding = f64::INFINITY;
+        }
+        search.candidates = vec![moved, stayed];
+        Some(search)
     }
 
     /// Looks for a pose elsewhere that explains a scan clearly better than `pose` does; with what was found, a
@@ -275,11 +284,7 @@ impl Search {
             return None;
         }
         // It may be right after all.
-        search.candidates.push(Candidate {
-            estimate: freely,
-            score: score(map, scan, freely.pose),
-            scans: 1,
-        });
+        search.candidates.push(Candidate::new(map, scan, freely));
         Some(search)
     }
 }
@@ -287,8 +292,15 @@ impl Search {
 /// A pose may be wrong by this much along its heading without being another place [0.1 m].
 const NEARBY: i32 = 6;
 
-/// Odometry's share of error over a way of which nothing was seen.
+/// Odometry's share of error over a way of which nothing was seen...
 const ASTRAY: f64 = 0.05;
+/// ...and how far apart poses at its end are tried [m], [rad].
+const STEP: f64 = 0.2;
+const TURN: f64 = 0.06;
+
+/// Odometry that begins anew puts the car just anywhere, hardly ever where the scan fits as well as before: where it does,
+/// this many times the margin speaks for it.
+const FAVOUR: f64 = 1.5;
 
 /// Whether a score is that of a pose which explains a scan, at least in good part.
 fn explains(score: f64) -> bool {
@@ -304,14 +316,7 @@ pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
 fn candidates(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candidate> {
     seed(map, &scan.points, &parameters.search)
         .into_par_iter()
-        .map(|pose| {
-            let estimate = fitted(map, scan, pose, parameters);
-            Candidate {
-                estimate,
-                score: score(map, scan, estimate.pose),
-                scans: 1,
-            }
-        })
+        .map(|pose| Candidate::new(map, scan, fitted(map, scan, pose, parameters)))
         .collect()
 }
 

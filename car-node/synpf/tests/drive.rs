@@ -168,7 +168,7 @@ fn driven(map: &Arc<TrackMap>, seed: u64) -> Localizer {
 }
 
 #[test]
-fn a_log_of_which_a_piece_is_missing_is_followed_on() {
+fn a_car_that_jumps_with_its_odometry_is_found_where_that_has_put_it() {
     let map = ring();
     let earlier = |stamp: Stamp, by: f64| stamp.plus(-by);
     for missing in [0.5, common::lap() / 3.0] {
@@ -186,12 +186,14 @@ fn a_log_of_which_a_piece_is_missing_is_followed_on() {
             let mut scan = scan(&map, at + missing);
             scan.stamp = earlier(scan.stamp, missing);
             let update = localizer.on_scan(&scan).expect("an update");
-            if k > 1 {
-                let off = update.pose.distance(truth(at + missing));
-                assert!(
+            let off = update.pose.distance(truth(at + missing));
+            match k {
+                2 => assert_eq!(update.mode, Mode::Searching, "the pose is given up at once"),
+                20.. => assert!(
                     update.mode == Mode::Tracking && off < 0.05,
                     "{missing} s, {at}: {off}"
-                );
+                ),
+                _ => {}
             }
         }
         assert_eq!(localizer.odometry_jumps(), 1);

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::BufReader;
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 
 use maps::Pose;
@@ -21,6 +21,26 @@ pub enum SensorEvent {
     Odometry(Odometry),
     /// A gyroscope's yaw rate.
     YawRate(YawRate),
+}
+
+impl SensorEvent {
+    /// The message's own stamp.
+    pub fn stamp(&self) -> Stamp {
+        match self {
+            Self::Scan(scan) => scan.stamp,
+            Self::Odometry(odometry) => odometry.stamp,
+            Self::YawRate(yaw_rate) => yaw_rate.stamp,
+        }
+    }
+
+    /// The same, to change it.
+    pub fn stamp_mut(&mut self) -> &mut Stamp {
+        match self {
+            Self::Scan(scan) => &mut scan.stamp,
+            Self::Odometry(odometry) => &mut odometry.stamp,
+            Self::YawRate(yaw_rate) => &mut yaw_rate.stamp,
+        }
+    }
 }
 
 /// A message with the time at which it arrived.
@@ -65,10 +85,10 @@ pub enum BagError {
         /// The bag.
         path: PathBuf,
         /// Why.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The file is not MCAP, or is damaged.
-    #[error("{path}: not a readable MCAP file after {messages} messages: {source}")]
+    #[error("{path}: not a readable MCAP file after {messages} messages: {source}{}", advice(.source, *.messages))]
     Mcap {
         /// The bag.
         path: PathBuf,
@@ -111,6 +131,15 @@ pub enum BagError {
         /// The frame of the scans.
         laser: String,
     },
+}
+
+/// What to do about a file that is no bag.
+fn advice(fault: &McapError, messages: u64) -> &'static str {
+    match fault {
+        McapError::BadMagic => " (`ros2 bag convert` makes one of a .db3 bag)",
+        McapError::UnexpectedEof if messages > 0 => " (`mcap recover` saves what is whole)",
+        _ => "",
+    }
 }
 
 /// A topic's messages, decoded.
@@ -181,10 +210,35 @@ pub struct SensorLog {
     pub topics: Topics,
 }
 
+impl SensorLog {
+    /// The stamp of the first scan.
+    pub fn first_scan(&self) -> Option<Stamp> {
+        let mut events = self.arrivals.iter().map(|arrival| &arrival.event);
+        events
+            .find(|event| matches!(event, SensorEvent::Scan(_)))
+            .map(SensorEvent::stamp)
+    }
+
+    /// From the first scan to the last message [s]; 0 without a scan.
+    pub fn lasts(&self) -> f64 {
+        match (self.first_scan(), self.arrivals.last()) {
+            (Some(first), Some(last)) => last.event.stamp().since(first),
+            _ => 0.0,
+        }
+    }
+}
+
 impl Bag {
     /// Reads a bag. Topics that no localizer needs are passed over.
     pub fn read(path: &Path) -> Result<Self, BagError> {
-        let file = File::open(path).map_err(|source| BagError::Open {
+        let open = || {
+            if path.is_dir() {
+                let advice = "is a folder: give the .mcap file in it";
+                return Err(io::Error::new(io::ErrorKind::IsADirectory, advice));
+            }
+            File::open(path)
+        };
+        let file = open().map_err(|source| BagError::Open {
             path: path.into(),
             source,
         })?;

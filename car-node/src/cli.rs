@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 
 use car_node::evaluate::{Fault, Start};
+use car_node::link::endpoint;
 use car_node::node::Begin;
 use car_node::ros_pose;
 use car_node::source::Ros2Options;
@@ -74,7 +75,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "FILE.mcap", required_if_eq("source", "bag"))]
     pub(crate) bag: Option<PathBuf>,
     /// With --source ros2: the zenoh router (rmw_zenohd) or bridge of the ROS side.
-    #[arg(long, value_name = "ENDPOINT", default_value = Ros2Options::ENDPOINT)]
+    #[arg(long, value_name = "ENDPOINT", default_value = Ros2Options::ENDPOINT, value_parser = endpoint)]
     pub(crate) ros: String,
     /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
     #[arg(long, value_name = "N")]
@@ -99,11 +100,11 @@ pub(crate) struct Run {
     #[arg(long, value_name = "NAME", default_value = "car-1")]
     pub(crate) car: CarName,
     /// Play a bag this many times as fast.
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
     pub(crate) rate: f64,
     /// Pit wall to dial, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or found by
     /// multicast].
-    #[arg(long, value_name = "ENDPOINT")]
+    #[arg(long, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
     /// Publish predicted poses at odometry rate, and not only at scan rate.
     #[arg(long)]
@@ -144,7 +145,7 @@ pub(crate) struct TopicArguments {
     #[arg(long, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
     /// Pose of the laser on base_link [m, m, rad] [default: by /tf_static; 0.27 m ahead without it].
-    #[arg(long, value_name = "X,Y,HEADING", value_parser = pose, allow_hyphen_values = true)]
+    #[arg(long, value_name = "X,Y,HEADING", value_parser = laser, allow_hyphen_values = true)]
     pub(crate) laser: Option<Pose>,
 }
 
@@ -158,7 +159,7 @@ pub(crate) struct Bags {
     #[arg(long = "bag", value_name = "FILE.mcap", required = true, num_args = 1..)]
     pub(crate) files: Vec<PathBuf>,
     /// Which topics of the bags to take.
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Topics of the bags")]
     pub(crate) topics: TopicArguments,
 }
 
@@ -178,7 +179,8 @@ pub(crate) struct Evaluate {
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0")]
     pub(crate) seed: Vec<u64>,
     /// Do something to the log first, and tell what the health state said to it: kidnap@20+4 carries the car on by
-    /// 4 s of driving, 20 s after the first scan; so do no-scans, no-odometry, blocked (an opponent ahead) and
+    /// 4 s of driving, 20 s after the first scan, and hides it from odometry; splice@20+4 cuts the same piece out and leaves
+    /// odometry as it was logged, as in a bag that was edited; so do no-scans, no-odometry, blocked (an opponent ahead) and
     /// black-tubes; may be repeated.
     #[arg(long, value_name = "KIND@S+S")]
     pub(crate) fault: Vec<Fault>,
@@ -348,6 +350,10 @@ fn speed(text: &str) -> Result<f64, String> {
     within(text, 0.1, 2.0)
 }
 
+fn rate(text: &str) -> Result<f64, String> {
+    within(text, 0.01, 1000.0)
+}
+
 fn lap_length(text: &str) -> Result<f64, String> {
     within(text, 20.0, 500.0)
 }
@@ -371,6 +377,16 @@ fn pose(text: &str) -> Result<Pose, String> {
         Ok(pose)
     } else {
         Err("not finite".into())
+    }
+}
+
+/// `x,y,heading` of a laser.
+fn laser(text: &str) -> Result<Pose, String> {
+    let mount = pose(text)?;
+    if mount.x.hypot(mount.y) < 10.0 {
+        Ok(mount)
+    } else {
+        Err("a laser is within 10 m of base_link".into())
     }
 }
 
@@ -409,5 +425,24 @@ mod tests {
         assert!(pose("1,2,north").is_err());
         assert_eq!(pose("1,2,NaN"), Err("not finite".into()));
         assert_eq!(start("truth"), Ok(Start::Truth));
+        assert!(laser("0.27,0,0").is_ok() && laser("270,0,0").is_err());
+    }
+
+    #[test]
+    fn endpoints_are_refused_before_anything_is_dialled() {
+        for good in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tls/pit.local:7447"] {
+            assert_eq!(endpoint(good), Ok(good.into()));
+        }
+        for bad in [
+            "",
+            "nonsense",
+            "127.0.0.1:7447",
+            "tcp/127.0.0.1",
+            "tcp/a:b",
+            "tpc/a:1",
+            "tcp/a:70000",
+        ] {
+            assert!(endpoint(bad).is_err(), "{bad}");
+        }
     }
 }

@@ -351,11 +351,7 @@ impl Loop {
             Feed::Placed(pose) => return self.placed(pose),
         };
         let now = self.now();
-        let stamp = match &event {
-            SensorEvent::Scan(scan) => scan.stamp,
-            SensorEvent::Odometry(odometry) => odometry.stamp,
-            SensorEvent::YawRate(yaw_rate) => yaw_rate.stamp,
-        };
+        let stamp = event.stamp();
         let counters = Arc::clone(&self.filter.shared.counters);
         counters.arrived(&event, now.since(stamp), now.0 as f64 * 1e-9, queued);
         let result = match event {

@@ -7,6 +7,7 @@
 use std::time::Duration;
 
 use protocol::{CarName, Key, Topic};
+use zenoh::config::EndPoint;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
@@ -45,6 +46,22 @@ const LOCAL_WALL: &str = "tcp/127.0.0.1:7447";
 const SEND_BUFFER: usize = 16 * 1024;
 /// What is written to the link in one piece [bytes]: a pose waits for no more than that of a scan.
 const BATCH: usize = 8 * 1024;
+
+/// An endpoint as it is given on a command line, or what it should be.
+pub fn endpoint(text: &str) -> Result<String, String> {
+    let endpoint = text.parse::<EndPoint>().ok().filter(|endpoint| {
+        let port = endpoint
+            .address()
+            .as_str()
+            .rsplit_once(':')
+            .map(|(_, port)| port.parse::<u16>());
+        ["tcp", "tls", "udp"].contains(&endpoint.protocol().as_str()) && matches!(port, Some(Ok(_)))
+    });
+    match endpoint {
+        Some(_) => Ok(text.into()),
+        None => Err("should be tcp/HOST:PORT (or tls, udp), as in tcp/192.168.1.10:7447".into()),
+    }
+}
 
 /// Opens a session that dials `connect`; without one it looks for a pit wall on this machine and by multicast.
 pub fn open(connect: &[String]) -> Result<Session, LinkError> {

@@ -30,7 +30,7 @@ fn main() -> ExitCode {
         Err(error) => {
             tracing::debug!(?error);
             commands::complain(&error);
-            ExitCode::FAILURE
+            ExitCode::from(if error.is::<commands::BadUsage>() { 2 } else { 1 })
         }
     }
 }

@@ -181,7 +181,7 @@ impl RosPose {
         Pose::new(self.position.x, self.position.y, self.orientation.yaw())
     }
 
-    /// The same in space. None when it is not a transform.
+    /// The same in space. None when it is not a transform, or one beyond any car and any track.
     pub fn spatial(&self) -> Option<Isometry3<f64>> {
         let Orientation { x, y, z, w } = self.orientation;
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-3)?;
@@ -190,7 +190,7 @@ impl RosPose {
         transform
             .to_homogeneous()
             .iter()
-            .all(|v| v.is_finite())
+            .all(|v| v.is_finite() && v.abs() < 1e6)
             .then_some(transform)
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use maps::MapError;
 use protocol::ValueChange;
 use serde_json::Value;
 use synpf::{ParameterFault, Parameters};
@@ -27,13 +28,8 @@ pub enum SetError {
     #[error("no parameter set {0:?}: neither a file nor one of {names}", names = Parameters::NAMES.join(", "))]
     Unknown(String),
     /// The file does not read.
-    #[error("{path}: {source}")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Read(#[from] MapError),
     /// The file's values are refused, all of the faults.
     #[error("{path}: {}", .faults.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Faults {
@@ -57,10 +53,7 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
     if !path.exists() {
         return Err(SetError::Unknown(name_or_path.into()));
     }
-    let text = std::fs::read_to_string(path).map_err(|source| SetError::Read {
-        path: path.into(),
-        source,
-    })?;
+    let text = maps::read_text(path)?;
     let faulty = |faults| SetError::Faults {
         path: path.into(),
         faults,

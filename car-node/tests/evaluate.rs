@@ -238,30 +238,55 @@ fn a_drive_is_localized_measured_and_repeatable() {
 #[test]
 fn what_is_wrong_is_named() {
     let folder = tempfile::tempdir().expect("folder");
-    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
-    let complaint = |map: &Path, bag: &Path, more: &[&str]| {
-        let output = evaluate(map, bag, more);
-        assert!(!output.status.success());
-        assert!(output.stdout.is_empty(), "nothing on stdout but results");
-        String::from_utf8(output.stderr).expect("UTF-8")
-    };
-    let text = complaint(&map, &bag, &["--scan-topic", "/scan_2"]);
-    assert!(
-        text.contains("/scan_2") && text.contains("/vesc/odom"),
-        "names what there is: {text}"
-    );
-    let text = complaint(&map, &bag, &["--params", "no-such-set"]);
-    assert!(text.contains("no-such-set"), "{text}");
-    let text = complaint(&map, &map, &[]);
-    assert!(
-        text.contains("map.yaml") && text.contains("MCAP"),
-        "the map is no bag: {text}"
-    );
-
+    let here = folder.path();
+    let (map, bag) = (write_map(here), write_bag(here));
     // A bag cut short in the middle, as by a full disk.
     let bytes = fs::read(&bag).expect("reads");
-    let cut = folder.path().join("cut.mcap");
+    let cut = here.join("cut.mcap");
     fs::write(&cut, &bytes[..bytes.len() / 2]).expect("writes");
-    let text = complaint(&map, &cut, &[]);
-    assert!(text.contains("cut.mcap"), "{text}");
+    let fails = |code: i32, map: &Path, bag: &Path, more: &[&str], words: &[&str]| {
+        let output = evaluate(map, bag, more);
+        let text = String::from_utf8(output.stderr).expect("UTF-8");
+        assert_eq!(output.status.code(), Some(code), "{text}");
+        assert!(output.stdout.is_empty(), "nothing on stdout but results");
+        for word in words {
+            assert!(text.contains(word), "{text} should say {word}");
+        }
+    };
+    // A fault of the files.
+    fails(
+        1,
+        &map,
+        &bag,
+        &["--scan-topic", "/scan_2"],
+        &["/scan_2", "/vesc/odom"],
+    );
+    fails(1, &map, &map, &[], &["map.yaml: ", "MCAP", "ros2 bag convert"]);
+    fails(1, &map, here, &[], &["is a folder", ".mcap"]);
+    fails(1, &map, &cut, &[], &["cut.mcap: ", "mcap recover"]);
+    fails(1, &bag, &bag, &[], &["not a text file"]);
+    // A fault of the call.
+    fails(
+        2,
+        &map,
+        &bag,
+        &["--params", "no-such-set"],
+        &["no-such-set", "synpf-baseline"],
+    );
+    fails(
+        2,
+        &map,
+        &bag,
+        &["--fault", "kidnap@9+1"],
+        &["kidnap@9+1", "ends 4.0 s"],
+    );
+    fails(2, &map, &bag, &["--fault", "flood@1+1"], &["--fault", "splice"]);
+    fails(
+        2,
+        &map,
+        &bag,
+        &["--poses", "p.csv", "--seed", "0,1"],
+        &["--poses", "one --seed"],
+    );
+    fails(2, &map, &bag, &["--laser", "270,0,0"], &["--laser", "10 m"]);
 }

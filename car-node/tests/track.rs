@@ -17,11 +17,11 @@ fn car_node(folder: &Path, arguments: &[&str]) -> Output {
         .expect("the program starts")
 }
 
-/// What it complains of; it must fail, say so in one line that begins with its name, and print no result.
-fn complaint(folder: &Path, arguments: &[&str]) -> String {
+/// What it complains of; it must fail with that code, and say so in one line that begins with its name.
+fn complaint(folder: &Path, arguments: &[&str], code: i32) -> String {
     let output = car_node(folder, arguments);
     let text = String::from_utf8(output.stderr).expect("text");
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {text}");
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {text}");
     assert!(
         text.starts_with("car-node: ") && text.lines().count() == 1,
         "{text}"
@@ -99,7 +99,7 @@ fn a_faulty_description_is_refused_by_its_key_or_line_and_writes_nothing() {
         let text = OVAL.replace(from, to);
         assert_ne!(text, OVAL, "{from} stands in the description");
         fs::write(here.join("t.yaml"), text).expect("writes");
-        let said = complaint(here, &["track", "new", "out", "--from", "t.yaml"]);
+        let said = complaint(here, &["track", "new", "out", "--from", "t.yaml"], 1);
         assert!(said.contains(names), "{said} should name {names}");
         assert!(!here.join("out").exists(), "{to}: something was written");
     }
@@ -110,10 +110,11 @@ fn files_that_are_missing_in_the_way_or_spoilt_are_named() {
     let folder = TempDir::new().expect("a folder");
     let here = folder.path();
     fs::write(here.join("oval.yaml"), OVAL).expect("writes");
-    let named = |arguments: &[&str], names: &str| {
-        let said = complaint(here, arguments);
+    let fails = |code: i32, arguments: &[&str], names: &str| {
+        let said = complaint(here, arguments, code);
         assert!(said.contains(names), "{arguments:?}: {said} should name {names}");
     };
+    let named = |arguments: &[&str], names: &str| fails(1, arguments, names);
     named(&["track", "new", "out", "--from", "none.yaml"], "none.yaml: ");
     named(&["track", "new", "out", "--from", "."], ".: ");
     named(
@@ -134,13 +135,25 @@ fn files_that_are_missing_in_the_way_or_spoilt_are_named() {
         &["race", "--track", "nowhere"],
         &["track", "check", ""],
     ] {
-        named(command, "one of club, hall, park, mirror");
+        fails(2, command, "one of club, hall, park, mirror");
     }
     named(
         &["track", "draw", "club", "--svg", "none/club.svg"],
         "none/club.svg: ",
     );
-    named(&["race", "--params", "none"], "none");
+    fails(2, &["race", "--params", "none"], "none");
+    let bytes: Vec<u8> = (0..=255).collect();
+    fs::write(here.join("noise"), bytes).expect("writes");
+    for command in [
+        &["race", "--params", "noise"][..],
+        &["race", "--raceline", "noise"],
+        &["track", "check", "noise"],
+        &["track", "new", "out", "--from", "noise"],
+    ] {
+        named(command, "noise: not a text file");
+    }
+    fs::write(here.join("noise.yaml"), "sigma_hit: .nan\n").expect("writes");
+    named(&["race", "--params", "noise.yaml"], "line 1, column 12");
 
     assert!(
         car_node(here, &["track", "new", "mine", "--from", "oval.yaml"])
@@ -148,6 +161,12 @@ fn files_that_are_missing_in_the_way_or_spoilt_are_named() {
             .success()
     );
     named(&["track", "new", "mine", "--from", "oval.yaml"], "--force");
+    fs::create_dir(here.join("lineless")).expect("a folder");
+    for file in ["map.yaml", "map.png"] {
+        fs::copy(here.join("mine").join(file), here.join("lineless").join(file)).expect("copies");
+    }
+    named(&["track", "check", "lineless"], "--raceline FILE");
+    named(&["track", "check", "lineless"], "lineless/raceline.csv: ");
     let add = |file: &str, line: &str| {
         let path = here.join("mine").join(file);
         let good = fs::read_to_string(&path).expect("a file");

@@ -1,6 +1,7 @@
 //! What can be wrong with a map or a raceline that somebody else made.
 
-use std::io;
+use std::path::Path;
+use std::{fs, io};
 
 /// Why a map or a raceline could not be read. `file` is a path, or what the caller called the bytes.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +42,16 @@ pub enum MapError {
         /// What is wrong with it.
         fault: String,
     },
+}
+
+/// Reads a text file, or says which one could not be read.
+pub fn read_text(path: impl AsRef<Path>) -> Result<String, MapError> {
+    let path = path.as_ref();
+    let file = path.display().to_string();
+    fs::read_to_string(path).map_err(|source| match source.kind() {
+        io::ErrorKind::InvalidData => MapError::format(&file, "not a text file"),
+        _ => MapError::Read { file, source },
+    })
 }
 
 impl MapError {

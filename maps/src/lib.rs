@@ -14,7 +14,7 @@ mod raster;
 mod ray_cast;
 
 pub use distance_field::{DistanceField, Sample, solidity};
-pub use error::MapError;
+pub use error::{MapError, read_text};
 pub use grid::{Cell, OccupancyGrid};
 pub use map_file::{MapMetadata, MapMode};
 pub use pose::{Pose, wrap_angle};

@@ -10,7 +10,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::raster::{Raster, encode_png};
-use crate::{Cell, MapError, OccupancyGrid, Pose};
+use crate::{Cell, MapError, OccupancyGrid, Pose, read_text};
 
 /// Grey values that `map_saver` writes, which every reader's default thresholds tell apart.
 const FREE: u8 = 254;
@@ -159,10 +159,7 @@ impl OccupancyGrid {
     pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
         let file = path.display().to_string();
-        let yaml = fs::read_to_string(path).map_err(|source| MapError::Read {
-            file: file.clone(),
-            source,
-        })?;
+        let yaml = read_text(path)?;
         let metadata = MapMetadata::parse(&file, &yaml)?;
         let image = path.parent().unwrap_or(Path::new("")).join(&metadata.image);
         let bytes = fs::read(&image).map_err(|e| {

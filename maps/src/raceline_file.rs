@@ -6,13 +6,12 @@
 
 use std::f64::consts::FRAC_PI_2;
 use std::fmt::Write;
-use std::fs;
 use std::path::Path;
 
 use serde::Deserialize;
 
 use crate::raceline::Geometry;
-use crate::{MapError, Raceline, RacelineFault, RacelinePoint, wrap_angle};
+use crate::{MapError, Raceline, RacelineFault, RacelinePoint, read_text, wrap_angle};
 
 /// Speed along a line whose file gives none (a centre line) [m/s]: what a careful driver does anywhere.
 const DEFAULT_SPEED: f64 = 2.0;
@@ -21,11 +20,7 @@ impl Raceline {
     /// Reads a raceline file; its content tells the format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
-        let file = path.display().to_string();
-        match fs::read_to_string(path) {
-            Ok(text) => Self::parse(&file, &text),
-            Err(source) => Err(MapError::Read { file, source }),
-        }
+        Self::parse(&path.display().to_string(), &read_text(path)?)
     }
 
     /// Reads a raceline's text, in any of the formats; `file` names it in errors.

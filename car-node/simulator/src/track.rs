@@ -4,7 +4,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::Path;
 
-use maps::{MapError, OccupancyGrid, Raceline};
+use maps::{MapError, OccupancyGrid, Raceline, read_text};
 
 use crate::generator::slowed_to;
 use crate::{SpeedParams, Walls};
@@ -49,11 +49,7 @@ impl Track {
         let mut line = Raceline::load(raceline.unwrap_or(&beside))?;
         let walls = folder.join("walls.csv");
         let walls = if walls.exists() {
-            let file = walls.display().to_string();
-            match fs::read_to_string(&walls) {
-                Ok(csv) => Walls::parse(&file, &csv)?,
-                Err(source) => return Err(MapError::Read { file, source }),
-            }
+            Walls::parse(&walls.display().to_string(), &read_text(&walls)?)?
         } else {
             line = slowed_to(&line, &FOREIGN);
             Walls::from_grid(&grid)

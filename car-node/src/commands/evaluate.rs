@@ -8,13 +8,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use car_node::bag::SensorLog;
-use car_node::evaluate::{
-    ErrorSummary, Fault, FaultKind, FaultReport, Outcome, Start, Truth, run as run_over,
-};
+use car_node::evaluate::{ErrorSummary, Fault, FaultReport, Outcome, Start, Truth, run as run_over};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use synpf::{Localizer, Update};
 
+use super::BadUsage;
 use crate::cli::Evaluate;
 
 /// The range table of the map, as reported.
@@ -42,14 +41,23 @@ struct Report {
 
 pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     if arguments.poses.is_some() && arguments.bags.files.len() * arguments.seed.len() > 1 {
-        bail!("--poses takes the poses of one run: give one --bag and one --seed");
+        let text = "--poses takes the poses of one run: give one --bag and one --seed";
+        bail!(BadUsage(text.into()));
     }
     let mut faults = arguments.fault.clone();
     faults.sort_by(|a, b| a.at.total_cmp(&b.at));
     let set = super::load_set(&arguments.params)?;
     let map = super::load_map(&arguments.bags.map)?;
     let mut logs = super::read_bags(&arguments.bags)?;
-    for (_, log) in &mut logs {
+    for (bag, log) in &mut logs {
+        let lasts = log.lasts();
+        if let Some(late) = faults.iter().find(|fault| fault.at >= lasts) {
+            let text = format!(
+                "--fault {late}: {} ends {lasts:.1} s after its first scan",
+                bag.display()
+            );
+            bail!(BadUsage(text));
+        }
         // The last first: cutting a piece out moves all that comes after it.
         for fault in faults.iter().rev() {
             fault.apply(log);
@@ -57,21 +65,23 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     }
     // Only the part of the map that the car can get to from its start, where that is known: a whole building takes
     // a minute and a gigabyte.
-    let start = match arguments.initial_pose {
-        Some(Start::Pose(pose)) => Some(pose),
-        Some(Start::Truth) => logs
+    let start = arguments.initial_pose.unwrap_or(Start::Global);
+    let place = match start {
+        Start::Pose(pose) => Some(pose),
+        Start::Truth => logs
             .first()
             .and_then(|(_, log)| log.truth.first())
             .map(|(_, pose)| *pose),
-        Some(Start::Global) | None => None,
+        Start::Global => None,
     };
     let before = Instant::now();
-    map.prepare(start, &set.parameters);
+    map.prepare(place, &set.parameters);
     let range_table = RangeTable {
         build_ms: before.elapsed().as_secs_f64() * 1e3,
         bytes: map.table_bytes(),
     };
 
+    let mut poses = arguments.poses.as_deref().map(PoseFile::create).transpose()?;
     let mut reports = Vec::new();
     for (bag, log) in &logs {
         let truth = Truth::new(log.truth.clone());
@@ -84,7 +94,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
                 seed,
             )?;
             let progress = progress_bar(bag, seed);
-            let outcome = over_bag(arguments, localizer, log, &truth, &progress)
+            let outcome = over_bag(localizer, log, &truth, start, poses.as_mut(), &progress)
                 .with_context(|| bag.display().to_string())?;
             reports.push(Report {
                 bag: bag.into(),
@@ -106,14 +116,14 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the state said to each fault. A kidnapping cuts its time out of the log: all that follows is that much earlier.
+/// What the state said to each fault. A kidnapping or a splice cuts its time out of the log: all that follows is that much earlier.
 fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
     let mut cut = 0.0;
     let moved: Vec<Fault> = faults
         .iter()
         .map(|fault| {
             let at = fault.at - cut;
-            if fault.kind == FaultKind::Kidnap {
+            if fault.kind.cuts() {
                 cut += fault.duration;
             }
             Fault { at, ..*fault }
@@ -133,15 +143,14 @@ fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
 }
 
 fn over_bag(
-    arguments: &Evaluate,
     mut localizer: Localizer,
     log: &SensorLog,
     truth: &Truth,
+    start: Start,
+    mut poses: Option<&mut PoseFile>,
     progress: &ProgressBar,
 ) -> anyhow::Result<Outcome> {
-    let mut poses = arguments.poses.as_deref().map(PoseFile::create).transpose()?;
     let mut failed = None;
-    let start = arguments.initial_pose.unwrap_or(Start::Global);
     let outcome = run_over(&mut localizer, &log.arrivals, truth, start, |update, done| {
         if update.number.is_multiple_of(64) {
             progress.set_position((done * 1000.0) as u64);
@@ -153,7 +162,7 @@ fn over_bag(
         }
     });
     progress.finish_and_clear();
-    if let Some(mut poses) = poses {
+    if let Some(poses) = poses {
         failed
             .map_or_else(|| poses.file.flush(), Err)
             .with_context(|| poses.path.display().to_string())?;

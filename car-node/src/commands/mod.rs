@@ -22,8 +22,8 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use car_node::bag::{Bag, SensorLog, Topics};
 use car_node::frames::Mount;
-use car_node::sets::{self, NamedSet};
-use maps::OccupancyGrid;
+use car_node::sets::{self, NamedSet, SetError};
+use maps::{MapError, OccupancyGrid};
 use simulator::{BUNDLED, Track};
 use synpf::TrackMap;
 
@@ -39,6 +39,11 @@ fn say(line: &str) {
         std::process::exit(1);
     }
 }
+
+/// A fault of the call, and not of what it names: exit code 2, as for what the parser refuses.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct BadUsage(String);
 
 /// Reads what a localizer needs of each bag.
 fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
@@ -84,7 +89,10 @@ fn warn_of_guess(source: &str) {
 
 /// A parameter set, with a warning that lists the keys that mean nothing.
 fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
-    let set = sets::load(name_or_path)?;
+    let set = sets::load(name_or_path).map_err(|error| match error {
+        SetError::Unknown(_) => BadUsage(error.to_string()).into(),
+        _ => anyhow::Error::from(error),
+    })?;
     if !set.unknown_keys.is_empty() {
         eprintln!(
             "car-node: warning: {name_or_path}: keys that mean nothing here: {}",
@@ -98,9 +106,19 @@ fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
 fn find_track(name_or_path: &str, raceline: Option<&Path>) -> anyhow::Result<Track> {
     if !BUNDLED.contains(&name_or_path) && !Path::new(name_or_path).exists() {
         let bundled = BUNDLED.join(", ");
-        bail!("no track {name_or_path:?}: neither a folder or a file nor one of {bundled}");
+        let text = format!("no track {name_or_path:?}: neither a folder or a file nor one of {bundled}");
+        bail!(BadUsage(text));
     }
-    Ok(Track::find(name_or_path, raceline)?)
+    Track::find(name_or_path, raceline).map_err(|error| match &error {
+        MapError::Read { file, source }
+            if raceline.is_none()
+                && source.kind() == ErrorKind::NotFound
+                && file.ends_with("raceline.csv") =>
+        {
+            anyhow::Error::from(error).context("a track needs its raceline; --raceline FILE names another")
+        }
+        _ => error.into(),
+    })
 }
 
 /// Says why a command failed: each cause once, though some libraries repeat their source's words in their own.

@@ -98,7 +98,9 @@ fn races(
     guide: Guide,
     quality: Quality,
 ) -> anyhow::Result<Report> {
-    let seeds: Vec<u64> = (0..arguments.seeds).map(|i| arguments.seed + i).collect();
+    let seeds: Vec<u64> = (0..arguments.seeds)
+        .map(|i| arguments.seed.wrapping_add(i))
+        .collect();
     let setup = RaceSetup {
         laps: arguments.laps,
         cars: arguments.cars.into(),

@@ -33,10 +33,9 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
         (SourceKind::Ros2, _) => {
             if arguments.connect.is_empty() {
-                bail!(
-                    "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: what answers at that port \
-                     on the car is ROS, not a pit wall"
-                );
+                let text = "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: what answers at that \
+                            port on the car is ROS, not a pit wall";
+                bail!(super::BadUsage(text.into()));
             }
             // The map first: its faults show without ROS.
             let map = map_file(arguments)?;

@@ -40,7 +40,7 @@ pub(crate) fn run(command: &TrackCommand) -> anyhow::Result<()> {
 
 fn described(path: &Path) -> anyhow::Result<(TrackSpec, String)> {
     let file = path.display().to_string();
-    let text = fs::read_to_string(path).with_context(|| file.clone())?;
+    let text = maps::read_text(path)?;
     Ok((TrackSpec::parse(&file, &text)?, text))
 }
 

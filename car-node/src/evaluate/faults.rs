@@ -17,6 +17,9 @@ pub enum FaultKind {
     /// The car is carried on to where it is at the fault's end, and odometry does not notice: this much of the log is
     /// cut out.
     Kidnap,
+    /// The same piece is cut out and the stamps are closed up, as when a bag is edited; odometry is left as it was logged, and
+    /// its pose jumps.
+    Splice,
     /// No scans come in.
     NoScans,
     /// No odometry comes in.
@@ -28,13 +31,19 @@ pub enum FaultKind {
 }
 
 impl FaultKind {
-    const NAMES: [(Self, &'static str); 5] = [
+    const NAMES: [(Self, &'static str); 6] = [
         (Self::Kidnap, "kidnap"),
+        (Self::Splice, "splice"),
         (Self::NoScans, "no-scans"),
         (Self::NoOdometry, "no-odometry"),
         (Self::Blocked, "blocked"),
         (Self::BlackTubes, "black-tubes"),
     ];
+
+    /// Whether it takes its time out of the log, so that all that follows comes that much earlier.
+    pub fn cuts(self) -> bool {
+        matches!(self, Self::Kidnap | Self::Splice)
+    }
 }
 
 /// Something that goes wrong, for a while. In text: `kidnap@20+4`.
@@ -91,22 +100,23 @@ impl FromStr for Fault {
 impl Fault {
     /// Does it to a log. A log without a scan stays as it is.
     pub fn apply(&self, log: &mut SensorLog) {
-        let Some(first) = log.arrivals.iter().find_map(|arrival| match &arrival.event {
-            SensorEvent::Scan(scan) => Some(scan.stamp),
-            _ => None,
-        }) else {
+        let Some(first) = log.first_scan() else {
             return;
         };
         let begin = first.plus(self.at);
         let within = |stamp: Stamp| (0.0..self.duration).contains(&stamp.since(begin));
         match self.kind {
-            FaultKind::Kidnap => self.cut(log, begin),
-            FaultKind::NoScans => log
-                .arrivals
-                .retain(|arrival| !(matches!(arrival.event, SensorEvent::Scan(_)) && within(stamp(arrival)))),
-            FaultKind::NoOdometry => log
-                .arrivals
-                .retain(|arrival| matches!(arrival.event, SensorEvent::Scan(_)) || !within(stamp(arrival))),
+            FaultKind::Kidnap => {
+                self.cut(log, begin);
+                rejoin_odometry(log, begin);
+            }
+            FaultKind::Splice => self.cut(log, begin),
+            FaultKind::NoScans => log.arrivals.retain(|arrival| {
+                !(matches!(arrival.event, SensorEvent::Scan(_)) && within(arrival.event.stamp()))
+            }),
+            FaultKind::NoOdometry => log.arrivals.retain(|arrival| {
+                matches!(arrival.event, SensorEvent::Scan(_)) || !within(arrival.event.stamp())
+            }),
             FaultKind::Blocked => on_beams(log, within, |angle, range| {
                 if angle.abs() < FRAC_PI_4 {
                     *range = range.min(0.7);
@@ -120,48 +130,40 @@ impl Fault {
         }
     }
 
-    /// Cuts the fault's time out: what comes later comes that much earlier, and odometry goes on from where it was.
+    /// Cuts the fault's time out: what comes later comes that much earlier.
     fn cut(&self, log: &mut SensorLog, begin: Stamp) {
         let within = |stamp: Stamp| (0.0..self.duration).contains(&stamp.since(begin));
-        let later = |stamp: Stamp| stamp.since(begin) >= self.duration;
-        log.arrivals.retain(|arrival| !within(stamp(arrival)));
-        let (mut before, mut after) = (None, None);
-        for arrival in &mut log.arrivals {
-            if let SensorEvent::Odometry(odometry) = &mut arrival.event {
-                if later(odometry.stamp) {
-                    let (from, to): (Pose, Pose) = (
-                        *after.get_or_insert(odometry.pose),
-                        *before.get_or_insert(odometry.pose),
-                    );
-                    odometry.pose = to * odometry.pose.since(from);
-                } else {
-                    before = Some(odometry.pose);
-                }
-            }
-            if later(stamp(arrival)) {
-                arrival.log_time = arrival.log_time.plus(-self.duration);
-                let stamp = match &mut arrival.event {
-                    SensorEvent::Scan(scan) => &mut scan.stamp,
-                    SensorEvent::Odometry(odometry) => &mut odometry.stamp,
-                    SensorEvent::YawRate(yaw_rate) => &mut yaw_rate.stamp,
-                };
+        let close_up = |stamp: &mut Stamp, by: Stamp| {
+            if by.since(begin) >= self.duration {
                 *stamp = stamp.plus(-self.duration);
             }
+        };
+        log.arrivals.retain(|arrival| !within(arrival.event.stamp()));
+        for Arrival { log_time, event } in &mut log.arrivals {
+            let stamp = event.stamp();
+            close_up(log_time, stamp);
+            close_up(event.stamp_mut(), stamp);
         }
         log.truth.retain(|(stamp, _)| !within(*stamp));
         for (stamp, _) in &mut log.truth {
-            if later(*stamp) {
-                *stamp = stamp.plus(-self.duration);
-            }
+            close_up(stamp, *stamp);
         }
     }
 }
 
-fn stamp(arrival: &Arrival) -> Stamp {
-    match &arrival.event {
-        SensorEvent::Scan(scan) => scan.stamp,
-        SensorEvent::Odometry(odometry) => odometry.stamp,
-        SensorEvent::YawRate(yaw_rate) => yaw_rate.stamp,
+/// Lets odometry go on after `cut` from where it was before.
+fn rejoin_odometry(log: &mut SensorLog, cut: Stamp) {
+    let (mut before, mut after) = (None, None);
+    for arrival in &mut log.arrivals {
+        if let SensorEvent::Odometry(odometry) = &mut arrival.event {
+            if odometry.stamp.since(cut) >= 0.0 {
+                let from: Pose = *after.get_or_insert(odometry.pose);
+                let to: Pose = *before.get_or_insert(odometry.pose);
+                odometry.pose = to * odometry.pose.since(from);
+            } else {
+                before = Some(odometry.pose);
+            }
+        }
     }
 }
 
@@ -234,18 +236,37 @@ mod tests {
         log
     }
 
+    fn odometry(log: &SensorLog) -> Vec<Odometry> {
+        let events = log.arrivals.iter().map(|arrival| &arrival.event);
+        events
+            .filter_map(|event| match event {
+                SensorEvent::Odometry(odometry) => Some(*odometry),
+                _ => None,
+            })
+            .collect()
+    }
+
+    #[test]
+    fn of_a_spliced_log_the_clocks_go_on_and_odometry_jumps_as_far_as_the_car() {
+        let (kidnapped, spliced) = (after("kidnap@4+3"), after("splice@4+3"));
+        assert_eq!(spliced.truth, kidnapped.truth);
+        let [hidden, jumps] = [&kidnapped, &spliced].map(odometry);
+        let stamps = |list: &[Odometry]| list.iter().map(|o| o.stamp).collect::<Vec<_>>();
+        assert_eq!(stamps(&jumps), stamps(&hidden));
+        let steps: Vec<f64> = jumps
+            .windows(2)
+            .map(|pair| pair[1].pose.x - pair[0].pose.x)
+            .collect();
+        let far: Vec<_> = steps.iter().filter(|step| **step > 0.11).collect();
+        assert!(far.len() == 1 && (far[0] - 3.1).abs() < 1e-9, "{far:?}");
+        assert!(jumps.iter().all(|o| spliced.truth.contains(&(o.stamp, o.pose))));
+    }
+
     #[test]
     fn a_kidnapped_car_is_elsewhere_and_its_odometry_and_clocks_have_not_noticed() {
         let log = after("kidnap@4+3");
         assert_eq!(log.arrivals.len(), 140);
-        let odometry: Vec<_> = log
-            .arrivals
-            .iter()
-            .filter_map(|arrival| match &arrival.event {
-                SensorEvent::Odometry(odometry) => Some(odometry),
-                _ => None,
-            })
-            .collect();
+        let odometry = odometry(&log);
         let truth = |stamp| log.truth.iter().find(|(at, _)| *at == stamp).expect("known").1;
         for pair in odometry.windows(2) {
             assert!((pair[1].stamp.since(pair[0].stamp) - 0.1).abs() < 1e-9);

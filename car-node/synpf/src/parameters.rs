@@ -125,7 +125,7 @@ impl Parameters {
         let file: Value = serde_saphyr::from_str(text).map_err(|e| {
             vec![ParameterFault {
                 key: "file".into(),
-                fault: e.to_string(),
+                fault: e.without_snippet().to_string(),
             }]
         })?;
         let Some(given) = reference::parameter_table(&file) else {

@@ -28,6 +28,9 @@ pub struct Verdict {
 /// Ages of poses are summarised over this long [s].
 const AGE_WINDOW: f64 = 1.0;
 
+/// A jump of the odometry is told for so long [s].
+const JUMP_TOLD: f64 = 3.0;
+
 /// Follows one localizer.
 #[derive(Debug)]
 pub struct Monitor {
@@ -53,6 +56,8 @@ pub struct Monitor {
     /// Scans refused in a row.
     refused: u32,
     ages: VecDeque<(Stamp, f64)>,
+    /// When odometry jumped last, and by how far [m].
+    jumped: Option<(Stamp, f64)>,
     /// Where STALE goes back to.
     before_stale: State,
 }
@@ -81,6 +86,7 @@ impl Monitor {
             last_update: None,
             refused: 0,
             ages: VecDeque::new(),
+            jumped: None,
             before_stale: State::Init,
         }
     }
@@ -122,6 +128,9 @@ impl Monitor {
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.last_scan = Some(now);
         self.refused = 0;
+        if update.odometry_jump != [0.0; 2] {
+            self.jumped = Some((now, update.odometry_jump[0]));
+        }
         // Out of STALE first: what this scan says to the pose is said with it.
         let missing = self.missing(now);
         self.stale_or_not(!missing.is_empty(), now);
@@ -148,7 +157,7 @@ impl Monitor {
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
         self.advance(update.mode, update.stamp, now);
-        self.verdict.causes = self.causes(missing);
+        self.verdict.causes = self.causes(missing, now);
         &self.verdict
     }
 
@@ -156,7 +165,7 @@ impl Monitor {
     pub fn tick(&mut self, now: Stamp) -> &Verdict {
         let missing = self.missing(now);
         self.stale_or_not(!missing.is_empty(), now);
-        self.verdict.causes = self.causes(missing);
+        self.verdict.causes = self.causes(missing, now);
         &self.verdict
     }
 
@@ -307,7 +316,7 @@ impl Monitor {
         .collect()
     }
 
-    fn causes(&self, missing: Vec<(CauseKind, f64)>) -> Vec<Cause> {
+    fn causes(&self, missing: Vec<(CauseKind, f64)>, now: Stamp) -> Vec<Cause> {
         let plain = |kind, severity| Cause {
             kind,
             severity,
@@ -331,6 +340,14 @@ impl Monitor {
         }
         if self.refused >= self.thresholds.bad_scans && self.verdict.state != State::Init {
             causes.push(plain(CauseKind::BadSensorData, Severity::Warning));
+        }
+        if let Some((at, distance)) = self.jumped
+            && now.since(at) < JUMP_TOLD
+        {
+            causes.push(Cause {
+                value: Some(finite(distance)),
+                ..plain(CauseKind::OdometryJump, Severity::Warning)
+            });
         }
         causes.extend(
             self.findings
@@ -522,6 +539,20 @@ mod tests {
         assert_eq!(drive.monitor.tick(drive.now).state, State::Stale);
         let searching = |update: &mut Update| update.mode = Mode::Searching;
         assert_eq!(drive.drive(SCAN, searching), [State::Stale, State::Lost]);
+    }
+
+    #[test]
+    fn a_jump_of_the_odometry_is_told_for_a_while() {
+        let mut drive = Drive::localized();
+        drive.drive(SCAN, |update| {
+            update.mode = Mode::Searching;
+            update.odometry_jump = [7.0, 0.1];
+        });
+        assert_eq!(drive.monitor.verdict().state, State::Lost);
+        let told = drive.monitor.verdict().causes.iter().map(ToString::to_string);
+        assert!(told.eq(["odometry has jumped 7.00 m"]), "{:?}", drive.kinds());
+        drive.drive(5.0, |_| ());
+        assert_eq!(drive.monitor.verdict().causes, []);
     }
 
     #[test]

@@ -130,6 +130,8 @@ pub struct Update {
     pub w_ratio: f64,
     /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
     pub innovation: [f64; 2],
+    /// By how far odometry has jumped since the update before [m], [rad]; 0 when it has not.
+    pub odometry_jump: [f64; 2],
     /// Slip: (odometry's distance - the posterior's) / odometry's, over the last 0.3 s; positive when the wheels
     /// spin; 0 below walking speed.
     pub slip: f64,
@@ -193,6 +195,8 @@ pub struct Localizer {
     slip_window: SlipWindow,
     slip: Slip,
     slip_model: SlipModel,
+    /// See [`Update::odometry_jump`].
+    odometry_jump: [f64; 2],
     /// How much nearer the walls stand than the map has them, as learned so far [m].
     wall_offset: f64,
     w_ratio: f64,
@@ -246,6 +250,7 @@ impl Localizer {
             slip_window: SlipWindow::default(),
             slip: Slip::default(),
             slip_model: SlipModel::default(),
+            odometry_jump: [0.0; 2],
             wall_offset: 0.0,
             w_ratio: 1.0,
             settled: 0,
@@ -382,6 +387,9 @@ impl Localizer {
         }
         let motion = odom.since(odom_before);
         let leap = self.track.take_leap();
+        self.odometry_jump = leap.map_or([0.0; 2], |leap| {
+            [odom.distance(leap * odom), maps::wrap_angle(leap.heading).abs()]
+        });
         match self.mode {
             Mode::Uninitialized => return Err(Dropped::NotInitialized),
             Mode::Tracking => {
@@ -648,6 +656,7 @@ impl Localizer {
             no_return: self.scan.no_return,
             w_ratio: self.w_ratio,
             innovation: [innovation.x.hypot(innovation.y), innovation.heading.abs()],
+            odometry_jump: self.odometry_jump,
             slip: self.slip.ratio,
             yaw_rate_residual: self.slip.yaw_rate,
         }
@@ -773,11 +782,6 @@ impl Localizer {
             pose: map_from_grid * Pose::new(p.x[i].into(), p.y[i].into(), p.heading[i].into()),
             weight: p.weight[i].into(),
         })
-    }
-
-    /// Jumps of odometry's pose that were taken out so far.
-    pub fn odometry_jumps(&self) -> u64 {
-        self.track.jumps
     }
 }
 

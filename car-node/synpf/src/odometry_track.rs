@@ -21,8 +21,6 @@ pub(crate) struct OdometryTrack {
     speeds: VecDeque<(Stamp, f64)>,
     /// What the car was doing at the last message.
     drive: Drive,
-    /// Jumps taken out so far.
-    pub(crate) jumps: u64,
     /// What would bring the poses that follow the last jumps, in the smooth frame, to where they are if the car jumped.
     leap: Option<Pose>,
 }
@@ -87,7 +85,6 @@ impl OdometryTrack {
         let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + possible[0];
         let before = self.points.back().expect("a last message has a point").pose;
         if (off[0] > possible[0] || off[1] > possible[1]) && !gone_on {
-            self.jumps += 1;
             let leap = before * step * (before * expected).inverse();
             self.leap = Some(self.leap.map_or(leap, |earlier| earlier * leap));
             step = expected;
@@ -288,10 +285,12 @@ mod tests {
         for message in &mut messages[5..] {
             message.pose.x += 7.0;
         }
-        let track = track(messages);
-        assert_eq!(track.jumps, 1);
+        let mut track = track(messages);
+        let leap = track.take_leap().expect("a jump");
         let (pose, _) = track.at(Stamp(9 * 20_000_000), 0.0).expect("covered");
         assert!(pose.distance(circle(9).pose) < 1e-2);
+        assert!((leap * pose).distance(Pose::new(7.0, 0.0, 0.0) * circle(9).pose) < 1e-2);
+        assert_eq!(track.take_leap(), None, "asked once");
     }
 
     #[test]

@@ -4,7 +4,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Invalid, Message, Schema};
+use crate::codec::Payload;
+use crate::{CodecError, Invalid, Message, Schema};
 
 /// The state with its causes, and every number behind it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -121,6 +122,8 @@ pub enum CauseKind {
     BadSensorData,
     /// A search of the whole map is under way.
     Searching,
+    /// Odometry has jumped: it began anew, or the car was carried.
+    OdometryJump,
 }
 
 impl CauseKind {
@@ -147,13 +150,18 @@ impl CauseKind {
             Self::NoOdometry => "no odometry",
             Self::BadSensorData => "bad sensor data",
             Self::Searching => "searching the map",
+            Self::OdometryJump => "odometry has jumped",
         }
     }
 
     /// The unit of its value.
     pub fn unit(self) -> &'static str {
         match self {
-            Self::Residual | Self::SpreadAlong | Self::SpreadAcross | Self::Innovation => "m",
+            Self::Residual
+            | Self::SpreadAlong
+            | Self::SpreadAcross
+            | Self::Innovation
+            | Self::OdometryJump => "m",
             Self::YawRate => "rad/s",
             Self::Age | Self::NoScan | Self::NoOdometry => "s",
             _ => "",
@@ -242,6 +250,13 @@ pub struct Proposal {
 impl Message for Health {
     const SCHEMA: Schema = Schema::Health;
     const MAX_LEN: usize = 4096;
+
+    /// 2: a cause more.
+    const VERSION: u16 = 2;
+
+    fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
+        (version == 1).then(|| payload.read())
+    }
 
     fn validate(&self) -> Result<(), Invalid> {
         Invalid::unless_at_most("causes", self.causes.len(), Self::MAX_CAUSES)?;

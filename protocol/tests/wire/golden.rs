@@ -107,21 +107,36 @@ fn golden(name: &str) -> &'static str {
         .unwrap_or("missing in golden.txt")
 }
 
+/// A message of an older version, of which the payload is given.
+fn older<M: Message>(version: u16, payload: &str) -> M {
+    let header = Header::new(M::SCHEMA, version, STAMPS);
+    let digits = payload.replace(' ', "");
+    let mut bytes = header.to_bytes().to_vec();
+    bytes.extend((0..digits.len()).step_by(2).map(|at| {
+        let digits = &digits[at..at + 2];
+        u8::from_str_radix(digits, 16).expect("hexadecimal digits")
+    }));
+    let (back, message) = decode::<M>(&bytes).expect("a good message");
+    assert_eq!(back, header);
+    message
+}
+
+#[test]
+fn health_of_version_1_is_read() {
+    let mut expected = samples::health(State::Degraded);
+    let last = expected.causes.pop().map(|cause| cause.kind);
+    assert_eq!(
+        last,
+        Some(CauseKind::OdometryJump),
+        "version 1 knows all but this"
+    );
+    assert_eq!(older::<Health>(1, golden("health of version 1")), expected);
+}
+
 /// Events as cars of versions 1 and 2 have sent them.
 #[test]
 fn events_of_older_versions_are_read() {
-    fn event(version: u16, payload: &str) -> Event {
-        let header = Header::new(Schema::Event, version, STAMPS);
-        let digits = payload.replace(' ', "");
-        let mut bytes = header.to_bytes().to_vec();
-        bytes.extend((0..digits.len()).step_by(2).map(|at| {
-            let digits = &digits[at..at + 2];
-            u8::from_str_radix(digits, 16).expect("hexadecimal digits")
-        }));
-        let (back, event) = decode::<Event>(&bytes).expect("an event");
-        assert_eq!(back, header);
-        event
-    }
+    let event = older::<Event>;
     // Update 77, by `ana`, under a command.
     let rest = "4d00000000000000 01 0300000000000000 616e61 01 100f0e0d0c0b0a090807060504030201";
     let stored = EventKind::SetStored {

@@ -57,7 +57,7 @@ pub(crate) mod tests_support {
             long_beams: 0.01,
             no_return: 0.01,
             w_ratio: 1.0,
-            odometry_jump: [0.0; 2],
+            odometry_jump: None,
             innovation: [0.01, 0.01],
             slip: 0.0,
             yaw_rate_residual: 0.0,

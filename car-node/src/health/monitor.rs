@@ -128,8 +128,8 @@ impl Monitor {
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.last_scan = Some(now);
         self.refused = 0;
-        if update.odometry_jump != [0.0; 2] {
-            self.jumped = Some((now, update.odometry_jump[0]));
+        if let Some([distance, _]) = update.odometry_jump {
+            self.jumped = Some((now, distance));
         }
         // Out of STALE first: what this scan says to the pose is said with it.
         let missing = self.missing(now);
@@ -546,7 +546,7 @@ mod tests {
         let mut drive = Drive::localized();
         drive.drive(SCAN, |update| {
             update.mode = Mode::Searching;
-            update.odometry_jump = [7.0, 0.1];
+            update.odometry_jump = Some([7.0, 0.1]);
         });
         assert_eq!(drive.monitor.verdict().state, State::Lost);
         let told = drive.monitor.verdict().causes.iter().map(ToString::to_string);

@@ -130,8 +130,8 @@ pub struct Update {
     pub w_ratio: f64,
     /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
     pub innovation: [f64; 2],
-    /// By how far odometry has jumped since the update before [m], [rad]; 0 when it has not.
-    pub odometry_jump: [f64; 2],
+    /// By how far odometry has jumped since the update before [m], [rad]; None when it has not.
+    pub odometry_jump: Option<[f64; 2]>,
     /// Slip: (odometry's distance - the posterior's) / odometry's, over the last 0.3 s; positive when the wheels
     /// spin; 0 below walking speed.
     pub slip: f64,
@@ -196,7 +196,7 @@ pub struct Localizer {
     slip: Slip,
     slip_model: SlipModel,
     /// See [`Update::odometry_jump`].
-    odometry_jump: [f64; 2],
+    odometry_jump: Option<[f64; 2]>,
     /// How much nearer the walls stand than the map has them, as learned so far [m].
     wall_offset: f64,
     w_ratio: f64,
@@ -250,7 +250,7 @@ impl Localizer {
             slip_window: SlipWindow::default(),
             slip: Slip::default(),
             slip_model: SlipModel::default(),
-            odometry_jump: [0.0; 2],
+            odometry_jump: None,
             wall_offset: 0.0,
             w_ratio: 1.0,
             settled: 0,
@@ -387,9 +387,8 @@ impl Localizer {
         }
         let motion = odom.since(odom_before);
         let leap = self.track.take_leap();
-        self.odometry_jump = leap.map_or([0.0; 2], |leap| {
-            [odom.distance(leap * odom), maps::wrap_angle(leap.heading).abs()]
-        });
+        self.odometry_jump =
+            leap.map(|leap| [odom.distance(leap * odom), maps::wrap_angle(leap.heading).abs()]);
         match self.mode {
             Mode::Uninitialized => return Err(Dropped::NotInitialized),
             Mode::Tracking => {

@@ -190,7 +190,8 @@ fn a_car_that_jumps_with_its_odometry_is_found_where_that_has_put_it() {
             match k {
                 2 => {
                     assert_eq!(update.mode, Mode::Searching, "the pose is given up at once");
-                    assert!(update.odometry_jump[0] > 0.5, "{:?}", update.odometry_jump);
+                    let jump = update.odometry_jump.expect("a jump");
+                    assert!(jump[0] > 0.5, "{jump:?}");
                 }
                 20.. => assert!(
                     update.mode == Mode::Tracking && off < 0.05,
@@ -217,7 +218,7 @@ fn odometry_that_begins_anew_moves_no_car() {
             odom += 0.02;
         }
         let update = localizer.on_scan(&scan(&map, at)).expect("an update");
-        jumps += usize::from(update.odometry_jump[0] > 1.0);
+        jumps += usize::from(update.odometry_jump.is_some());
         assert!(
             update.mode == Mode::Tracking && error(&update) < 0.05,
             "{at}: {}",
@@ -235,7 +236,7 @@ fn seconds_without_a_message_are_caught_up_by_the_odometry() {
         let updates = drive(&mut localizer, &map, 1.02 + gap, 1.5 + gap, 1.0);
         let worst = updates.iter().map(error).fold(0.0, f64::max);
         assert!(worst < 0.05, "after {gap} s: {worst}");
-        assert!(updates.iter().all(|update| update.odometry_jump == [0.0; 2]));
+        assert!(updates.iter().all(|update| update.odometry_jump.is_none()));
     }
 }
 

@@ -211,20 +211,14 @@ pub struct SensorLog {
 }
 
 impl SensorLog {
-    /// The stamp of the first scan.
-    pub fn first_scan(&self) -> Option<Stamp> {
-        let mut events = self.arrivals.iter().map(|arrival| &arrival.event);
-        events
-            .find(|event| matches!(event, SensorEvent::Scan(_)))
-            .map(SensorEvent::stamp)
-    }
-
-    /// From the first scan to the last message [s]; 0 without a scan.
-    pub fn lasts(&self) -> f64 {
-        match (self.first_scan(), self.arrivals.last()) {
-            (Some(first), Some(last)) => last.event.stamp().since(first),
-            _ => 0.0,
-        }
+    /// The stamps of the first and of the last scan; None without one.
+    pub fn span(&self) -> Option<[Stamp; 2]> {
+        let mut scans = self.arrivals.iter().filter_map(|arrival| match &arrival.event {
+            SensorEvent::Scan(scan) => Some(scan.stamp),
+            _ => None,
+        });
+        let first = scans.next()?;
+        Some([first, scans.next_back().unwrap_or(first)])
     }
 }
 

@@ -273,13 +273,9 @@ fn what_is_wrong_is_named() {
         &["--params", "no-such-set"],
         &["no-such-set", "synpf-baseline"],
     );
-    fails(
-        2,
-        &map,
-        &bag,
-        &["--fault", "kidnap@9+1"],
-        &["kidnap@9+1", "ends 4.0 s"],
-    );
+    for fault in ["no-scans@4+1", "kidnap@3+1"] {
+        fails(2, &map, &bag, &["--fault", fault], &[fault, "ends 4.0 s"]);
+    }
     fails(2, &map, &bag, &["--fault", "flood@1+1"], &["--fault", "splice"]);
     fails(
         2,

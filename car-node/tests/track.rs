@@ -142,6 +142,23 @@ fn files_that_are_missing_in_the_way_or_spoilt_are_named() {
         "none/club.svg: ",
     );
     fails(2, &["race", "--params", "none"], "none");
+    // Whatever the seed, there is a race.
+    let last = u64::MAX.to_string();
+    let race = car_node(
+        here,
+        &[
+            "race",
+            "--seed",
+            &last,
+            "--seeds",
+            "2",
+            "--laps",
+            "1",
+            "--localizer",
+            "truth",
+        ],
+    );
+    assert!(race.status.success(), "{race:?}");
     let bytes: Vec<u8> = (0..=255).collect();
     fs::write(here.join("noise"), bytes).expect("writes");
     for command in [

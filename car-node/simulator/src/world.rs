@@ -201,7 +201,8 @@ impl World {
                     StdRng::seed_from_u64(seed.wrapping_mul(1_000_003) ^ ((index as u64) << 8) ^ sensor)
                 };
                 // Sensors are not synchronised: their phases come from the seed, too.
-                let phase = |ticks: u64| TICK * ((seed.wrapping_add(index as u64 * 7) * 5) % ticks) as u32;
+                let phase =
+                    |ticks: u64| TICK * (seed.wrapping_add(index as u64 * 7).wrapping_mul(5) % ticks) as u32;
                 Car {
                     vehicle: Vehicle::at_rest(setup.vehicle, pose),
                     lidar: Lidar::new(setup.lidar, phase(10), stream(1)),

@@ -50,8 +50,8 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     let map = super::load_map(&arguments.bags.map)?;
     let mut logs = super::read_bags(&arguments.bags)?;
     for (bag, log) in &mut logs {
-        let lasts = log.lasts();
-        if let Some(late) = faults.iter().find(|fault| fault.at >= lasts) {
+        let lasts = log.span().map_or(0.0, |[first, last]| last.since(first));
+        if let Some(late) = faults.iter().find(|fault| fault.shows_at() > lasts) {
             let text = format!(
                 "--fault {late}: {} ends {lasts:.1} s after its first scan",
                 bag.display()

@@ -125,7 +125,7 @@ fn find_track(name_or_path: &str, raceline: Option<&Path>) -> anyhow::Result<Tra
 pub(crate) fn complain(error: &anyhow::Error) {
     let mut text = String::new();
     for cause in error.chain().map(ToString::to_string) {
-        if !text.ends_with(&cause) {
+        if !text.contains(&cause) {
             if !text.is_empty() {
                 text += ": ";
             }

@@ -98,9 +98,18 @@ impl FromStr for Fault {
 }
 
 impl Fault {
+    /// When the car is to be seen with it, from the first scan on [s]: at its beginning, or behind what it cuts out.
+    pub fn shows_at(&self) -> f64 {
+        if self.kind.cuts() {
+            self.at + self.duration
+        } else {
+            self.at
+        }
+    }
+
     /// Does it to a log. A log without a scan stays as it is.
     pub fn apply(&self, log: &mut SensorLog) {
-        let Some(first) = log.first_scan() else {
+        let Some([first, _]) = log.span() else {
             return;
         };
         let begin = first.plus(self.at);

@@ -119,6 +119,7 @@ function showPeople(names) {
 }
 
 let saved = "";
+let ending = false;
 function showRecording({ recording, disk_free: free, replay }) {
   const button = $("record");
   button.hidden = Boolean(replay);
@@ -133,17 +134,28 @@ function showRecording({ recording, disk_free: free, replay }) {
     const rate = recording.seconds > 5 ? recording.bytes / recording.seconds : 0;
     const left = free !== null && rate > 0 ? `, room for ${fixed(free / rate / 3600, 0)} h` : "";
     text = recording.error ?? `${lasting(recording.seconds)}, ${fixed(recording.bytes / 1e6, 1)} MB${left}, ${missing ? `${missing} MISSING` : "nothing missing"}`;
-    $("recording").title = recording.file;
   }
+  if (ending) text = "ending: waiting for what the cars have sent";
   if ($("recording").textContent !== text) $("recording").textContent = text;
+  // In full, where the room does not suffice.
+  const full = [text, recording?.file].filter(Boolean).join("\n");
+  if ($("recording").title !== full) $("recording").title = full;
 }
 
 async function record() {
   const on = !snapshot?.recording;
   $("record").disabled = true;
+  ending = !on;
   const { ok, body } = await post("/record", { on, operator: operator.value });
+  ending = false;
   $("record").disabled = false;
-  saved = !ok ? body : on ? "" : `saved: ${body.summary.messages} messages, ${body.missing ? `${body.missing} missing` : "nothing missing"}`;
+  if (!ok || on) {
+    saved = ok ? "" : body;
+    return;
+  }
+  const { messages, unanswered } = body.summary;
+  const silent = unanswered.length ? `; no answer from ${unanswered.join(", ")}` : "";
+  saved = `saved: ${messages} messages, ${body.missing ? `${body.missing} missing` : "nothing missing"}${silent}`;
 }
 
 let seeking = false;

@@ -39,8 +39,8 @@ export const element = (tag, className, text) => {
 
 export const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 
-/// Milliseconds, with a digit behind the point where there is room.
-const ms = (value) => fixed(value, value < 100 ? 1 : 0, " ms");
+/// Milliseconds, with a digit behind the point where there is room, and seconds where they are many.
+const ms = (value) => (value >= 1000 ? lasting(value / 1e3) : fixed(value, value < 100 ? 1 : 0, " ms"));
 
 /// How old the pose is.
 const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed(pose && pose.age_s * 1e3, 0, " ms"));

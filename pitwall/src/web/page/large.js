@@ -13,10 +13,10 @@ const MORE = [
 ];
 
 const CHARTS = [
-  ["alignment (good above 0.70, lost below 0.45)", { value: (p) => p.alignment, low: 0, high: 1, limits: [0.7, 0.45] }],
-  ["slip, -50 to 50 % (limits 8 and 20 %)", { value: (p) => p.slip, low: -0.5, high: 0.5, limits: [0.08, 0.2, -0.08, -0.2] }],
-  ["spread along the track, 0 to 1 m (limit 0.4 m)", { value: (p) => p.spread_along, low: 0, high: 1, limits: [0.4] }],
-  ["spread across the track, 0 to 0.5 m (limit 0.15 m)", { value: (p) => p.spread_across, low: 0, high: 0.5, limits: [0.15] }],
+  ["alignment (limits 0.70 and 0.45)", { value: (p) => p.alignment, low: 0, high: 1, limits: [0.7, 0.45] }],
+  ["slip, ±50 % (limits 8 and 20 %)", { value: (p) => p.slip, low: -0.5, high: 0.5, limits: [0.08, 0.2, -0.08, -0.2] }],
+  ["spread along, to 1 m (limit 0.4)", { value: (p) => p.spread_along, low: 0, high: 1, limits: [0.4] }],
+  ["across, to 0.5 m (limit 0.15)", { value: (p) => p.spread_across, low: 0, high: 0.5, limits: [0.15] }],
 ];
 
 /// The comparison of two sets, row by row.

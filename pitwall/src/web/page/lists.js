@@ -150,6 +150,11 @@ export function showLaps(table, laps, car) {
   table.replaceChildren(head, ...rows.reverse());
 }
 
+/// Metrics that are no shares and no counts.
+const UNITS = {
+  residual: " m", spread_along: " m", spread_across: " m", innovation: " m", innovation_angle: " rad", yaw_rate_residual: " rad/s", age_p50: " s", age_p99: " s",
+};
+
 /// Every number that the selected car has sent.
 export function showNumbers(table, car, pace) {
   const rows = [];
@@ -161,7 +166,7 @@ export function showNumbers(table, car, pace) {
       add("s, d", `${fixed(car.pose.s_m, 2)}, ${fixed(car.pose.d_m, 3)} m`);
     }
     if (car.set) add("set", `${car.set.name}, revision ${car.set.revision} by ${car.set.who}`);
-    for (const [name, value] of Object.entries(car.health?.metrics ?? {})) add(name.replaceAll("_", " "), fixed(value, name === "particles" ? 0 : 3));
+    for (const [name, value] of Object.entries(car.health?.metrics ?? {})) add(name.replaceAll("_", " "), fixed(value, name === "particles" ? 0 : 3, UNITS[name]));
     if (car.load) {
       add("update p50 / p99 / max", ["p50", "p99", "max"].map((k) => fixed(car.load.update_us[k] / 1e3, 2)).join(" / ") + " ms");
       add("scan age p50 / p99", ["p50", "p99"].map((k) => fixed(car.load.scan_age_us[k] / 1e3, 1)).join(" / ") + " ms");

@@ -244,8 +244,8 @@ mod tests {
         }
     }
 
-    fn health(state: State) -> Telemetry {
-        Telemetry::Health(Health {
+    fn health(at: i64, sequence: u64, lane: Lane, state: State) -> FleetEvent {
+        let health = Health {
             state,
             since: 0,
             causes: Vec::new(),
@@ -253,7 +253,8 @@ mod tests {
             metrics: None,
             proposal: None,
             auto: false,
-        })
+        };
+        message(at, sequence, lane, Topic::Health, Telemetry::Health(health))
     }
 
     fn appeared(at: i64) -> FleetEvent {
@@ -275,13 +276,7 @@ mod tests {
             (2, Lane::Complete),
             (3, Lane::Complete),
         ] {
-            fleet.apply(&message(
-                1,
-                sequence,
-                lane,
-                Topic::Health,
-                health(State::Localized),
-            ));
+            fleet.apply(&health(1, sequence, lane, State::Localized));
         }
         let view = &fleet.view(2)[0].streams["health"];
         assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
@@ -291,21 +286,9 @@ mod tests {
     fn a_late_message_does_not_turn_the_state_back() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
-        fleet.apply(&message(
-            1,
-            1,
-            Lane::Live,
-            Topic::Health,
-            health(State::Localized),
-        ));
-        fleet.apply(&message(1, 3, Lane::Live, Topic::Health, health(State::Lost)));
-        fleet.apply(&message(
-            1,
-            2,
-            Lane::Complete,
-            Topic::Health,
-            health(State::Degraded),
-        ));
+        fleet.apply(&health(1, 1, Lane::Live, State::Localized));
+        fleet.apply(&health(1, 3, Lane::Live, State::Lost));
+        fleet.apply(&health(1, 2, Lane::Complete, State::Degraded));
         assert_eq!(fleet.view(2)[0].state, "LOST");
     }
 
@@ -313,26 +296,14 @@ mod tests {
     fn a_silent_car_is_blind_and_said_so_once() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
-        fleet.apply(&message(
-            0,
-            1,
-            Lane::Live,
-            Topic::Health,
-            health(State::Localized),
-        ));
+        fleet.apply(&health(0, 1, Lane::Live, State::Localized));
         fleet.tick(SECOND / 2);
         assert_eq!(fleet.view(SECOND / 2)[0].state, "LOCALIZED");
         for tick in 3..6 {
             fleet.tick(tick * SECOND);
         }
         assert_eq!(fleet.view(6 * SECOND)[0].state, "BLIND");
-        fleet.apply(&message(
-            7 * SECOND,
-            2,
-            Lane::Live,
-            Topic::Health,
-            health(State::Localized),
-        ));
+        fleet.apply(&health(7 * SECOND, 2, Lane::Live, State::Localized));
         let said: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
         assert_eq!(said, ["BLIND: nothing comes from the car", "link is back"]);
     }

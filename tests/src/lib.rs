@@ -19,7 +19,7 @@ pub use synthetic_bag::{room, true_pose, write_bag};
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
-use pitwall::Role;
+use pitwall::{Hub, Role};
 use protocol::{Action, CarName, ParamsAction};
 
 /// How long anything may take before a test gives up.
@@ -28,6 +28,13 @@ pub const DEADLINE: Duration = Duration::from_secs(20);
 /// A car's name.
 pub fn named(name: &str) -> CarName {
     CarName::new(name).expect("a good name")
+}
+
+/// The set in force and its revision, as a pit wall knows them.
+pub fn in_force(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
+    let fleet = hub.fleet();
+    let params = fleet.car(car)?.params.as_ref()?;
+    Some((params.set.name.clone(), params.revision))
 }
 
 /// Puts a set in force, for good.

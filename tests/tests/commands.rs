@@ -5,23 +5,18 @@ use std::time::Duration;
 
 use pitwall::{Hub, Verdict, new_command_id};
 use protocol::{
-    Action, CarName, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps,
-    Telemetry, Topic, Value, encode,
+    Action, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps, Telemetry,
+    Topic, Value, encode,
 };
-use system_tests::{FakeCar, client, free_endpoint, named, router, select, start_real, stolen, wait_until};
+use system_tests::{
+    FakeCar, client, free_endpoint, in_force, named, router, select, start_real, stolen, wait_until,
+};
 
 fn revision(verdict: &Verdict) -> u64 {
     match verdict {
         Verdict::Answered { answer, .. } => answer.set.revision,
         other => panic!("no answer: {other:?}"),
     }
-}
-
-/// The set in force as a pit wall knows it.
-fn known(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
-    let fleet = hub.fleet();
-    let params = fleet.car(car)?.params.as_ref()?;
-    Some((params.set.name.clone(), params.revision))
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -43,7 +38,7 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
         .await,
         "the car drives"
     );
-    let mut expected = known(&hub, &car).map(|(_, revision)| revision);
+    let mut expected = in_force(&hub, &car).map(|(_, revision)| revision);
     let mut switched_at = Vec::new();
     for switch in 0..SWITCHES {
         let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
@@ -128,7 +123,7 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
     let node = start_real(&car, 0.0, &endpoint, None);
     for hub in [&first, &second] {
         assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
-        wait_until("the set in force is known", || known(hub, &car).is_some()).await;
+        wait_until("the set in force is known", || in_force(hub, &car).is_some()).await;
     }
     // Each switches to its own set, expecting what it last knew: of two at once, one is told to look again.
     let fight = |hub: Arc<Hub>, who: &'static str, name: &'static str| {
@@ -136,7 +131,7 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
         tokio::spawn(async move {
             let (mut done, mut stale) = (0, 0);
             for _ in 0..50 {
-                let expected = known(&hub, &car).map(|(_, revision)| revision);
+                let expected = in_force(&hub, &car).map(|(_, revision)| revision);
                 let verdict = hub
                     .link()
                     .command(&car, who, expected, select(name))
@@ -151,7 +146,7 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
             (done, stale)
         })
     };
-    let begun = known(&first, &car).expect("known").1;
+    let begun = in_force(&first, &car).expect("known").1;
     let ana = fight(first.clone(), "ana", "lq");
     let ben = fight(second.clone(), "ben", "adaptive");
     let (ana, ben) = (ana.await.expect("no panic"), ben.await.expect("no panic"));
@@ -160,10 +155,10 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
     wait_until("both know the last revision", || {
         [&first, &second]
             .into_iter()
-            .all(|hub| known(hub, &car).is_some_and(|(_, r)| r == last))
+            .all(|hub| in_force(hub, &car).is_some_and(|(_, r)| r == last))
     })
     .await;
-    assert_eq!(known(&first, &car), known(&second, &car));
+    assert_eq!(in_force(&first, &car), in_force(&second, &car));
     node.shutdown("test over");
     second.close().await;
     first.close().await;
@@ -217,7 +212,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
     let node = start_real(&car, 0.0, &endpoint, Some(folder.path()));
     assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
     wait_until("the set in force is known", || {
-        known(&hub, &car).is_some_and(|(name, _)| name == "lq")
+        in_force(&hub, &car).is_some_and(|(name, _)| name == "lq")
     })
     .await;
     let back = hub
@@ -232,7 +227,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         "answered again, not done again"
     );
     wait_until("hq stays in force", || {
-        known(&hub, &car) == Some(("hq".into(), revision(&back)))
+        in_force(&hub, &car) == Some(("hq".into(), revision(&back)))
     })
     .await;
     node.shutdown("test over");
@@ -281,8 +276,8 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
     let car = named("car-1");
     let node = start_real(&car, 0.0, &endpoint, None);
     assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
-    wait_until("the set in force is known", || known(&hub, &car).is_some()).await;
-    let before = known(&hub, &car);
+    wait_until("the set in force is known", || in_force(&hub, &car).is_some()).await;
+    let before = in_force(&hub, &car);
     let put = |values: &[(&str, Value)]| {
         let values = values
             .iter()
@@ -374,7 +369,7 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
         .command(&car, "ana", None, Action::Rates(RatesAction::Set(rates)))
         .await;
     assert!(error.is_err(), "{error:?}");
-    assert_eq!(known(&hub, &car), before);
+    assert_eq!(in_force(&hub, &car), before);
     node.shutdown("test over");
     hub.close().await;
 }
@@ -418,7 +413,7 @@ async fn acknowledgements_with_three_cars() {
         .map(|car| start_real(car, 0.0, &endpoint, Some(&folder.path().join(car.as_str()))))
         .collect();
     for car in &cars {
-        wait_until("the set in force is known", || known(&hub, car).is_some()).await;
+        wait_until("the set in force is known", || in_force(&hub, car).is_some()).await;
     }
     let (mut times, mut undisturbed, mut unanswered) = (Vec::new(), Vec::new(), 0);
     for switch in 0..SWITCHES {

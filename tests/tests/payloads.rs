@@ -6,7 +6,7 @@ use pitwall::Hub;
 use protocol::{
     Action, CarName, Command, CommandId, Key, LinkReport, Message, ParamsAction, Stamps, Topic, encode,
 };
-use system_tests::{free_endpoint, router, select, start_real, wait_until};
+use system_tests::{free_endpoint, in_force, router, select, start_real, wait_until};
 use zenoh::qos::CongestionControl;
 
 /// A program that belongs to nobody.
@@ -118,12 +118,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
         })
         .await
     );
-    let revision = || {
-        hub.fleet()
-            .car(&car)
-            .and_then(|car| Some(car.params.as_ref()?.revision))
-    };
-    let before = revision();
+    let before = in_force(&hub, &car);
     let stranger = stranger(&endpoint).await;
     let garbage = garbage();
     for topic in Topic::all() {
@@ -183,7 +178,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     // The car drives on, on the set that it had, and takes commands.
     let last = updates();
     wait_until("the car drives on", || updates() > last + 40).await;
-    assert_eq!(revision(), before);
+    assert_eq!(in_force(&hub, &car), before);
     let verdict = hub
         .link()
         .command(&car, "ana", None, Action::Params(ParamsAction::List))

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use pitwall::{Hub, Report, Verdict, read_events, unix_now};
 use protocol::{CarName, Outcome, Topic};
-use system_tests::{Behaviour, DEADLINE, FakeCar, client, free_endpoint, router, select, wait_until};
+use system_tests::{
+    Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, router, select, wait_until,
+};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_car_shows_up_and_is_blind_when_it_leaves() {
@@ -52,17 +54,9 @@ async fn a_second_program_joins_the_pit_wall_that_is_there() {
         .expect("a good command");
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     assert_eq!(car.set().name, "lq");
-    let on_both = |hub: &Hub| {
-        let fleet = hub.fleet();
-        fleet.car(car.name()).and_then(|car| {
-            Some((
-                car.params.as_ref()?.set.name.clone(),
-                car.params.as_ref()?.revision,
-            ))
-        })
-    };
     wait_until("both see the switch", || {
-        on_both(&hub) == Some(("lq".into(), 2)) && on_both(&viewer) == Some(("lq".into(), 2))
+        [&hub, &viewer].map(|hub| in_force(hub, car.name()))
+            == [Some(("lq".into(), 2)), Some(("lq".into(), 2))]
     })
     .await;
     viewer.close().await;

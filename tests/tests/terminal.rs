@@ -74,11 +74,10 @@ fn command(name: &str) -> Command {
     }
 }
 
-/// The set in force and its revision, as the car says it.
+/// The set in force and its revision, of a car that is there.
 fn in_force(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
-    let fleet = hub.fleet();
-    let params = fleet.car(car).filter(|car| car.alive)?.params.as_ref()?;
-    Some((params.set.name.clone(), params.revision))
+    hub.fleet().car(car).filter(|car| car.alive)?;
+    system_tests::in_force(hub, car)
 }
 
 /// Waits for a car in a process of its own, which takes its time on a busy machine.

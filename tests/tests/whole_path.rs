@@ -1,6 +1,6 @@
 //! From a bag to the pit wall, through every part: sensors, filter, health, network, fleet, commands, recording.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use car_node::bag::{Bag, Topics};
@@ -10,6 +10,7 @@ use pitwall::{Happening, Hub, Verdict, read_events};
 use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
 use synpf::TrackMap;
 use system_tests::{DEADLINE, free_endpoint, room, router, true_pose, wait_until, write_bag};
+use tempfile::TempDir;
 
 /// Starts a car that plays the bag in `folder`.
 fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
@@ -34,13 +35,19 @@ fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
     Node::start(config).expect("a car")
 }
 
-#[tokio::test(flavor = "multi_thread")]
-async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
+/// A pit wall that records: where cars dial, and the folder with the file.
+async fn recording() -> (String, Arc<Hub>, TempDir, PathBuf) {
     let endpoint = free_endpoint();
-    let folder = tempfile::tempdir().expect("a folder");
     let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("session.mcap");
     hub.start_recording(&file).await.expect("a new file");
+    (endpoint, hub, folder, file)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
+    let (endpoint, hub, folder, file) = recording().await;
     let node = start("car-1", folder.path(), &endpoint);
     let car = CarName::new("car-1").expect("a good name");
     assert!(hub.wait_for(&car, DEADLINE).await, "the car shows up");
@@ -80,7 +87,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
     .await;
 
     wait_until("the bag has ended", || node.source_ended()).await;
-    // The last messages are on their way; heartbeats twice a second tell of any that got lost.
+    // The last messages are on their way.
     wait_until("the recording has every update", || {
         let status = hub.recording().expect("a recording");
         let updates = status
@@ -161,11 +168,7 @@ fn position_rmse(file: &Path) -> (f64, usize) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn three_cars_are_recorded_without_a_hole() {
-    let endpoint = free_endpoint();
-    let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let file = folder.path().join("session.mcap");
-    hub.start_recording(&file).await.expect("a new file");
+    let (endpoint, hub, folder, _) = recording().await;
     let nodes: Vec<_> = ["car-1", "car-2", "car-3"]
         .map(|name| start(name, folder.path(), &endpoint))
         .into();

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use pitwall::{Car, Fleet};
 use protocol::{
     Action, CarName, Comparison, Fitness, ParameterSet, Params, ParamsAction, Reply, Shadow, StoredSet, Value,
 };
@@ -72,21 +73,9 @@ pub(super) async fn run(
 
 /// The set in force, as the car last said it.
 async fn get(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(no_such_car(&hub, car).await);
-    }
-    hub.wait_until(FIND, |fleet| {
-        fleet.car(car).is_some_and(|car| car.params.is_some())
-    })
-    .await;
-    let params = hub.fleet().car(car).and_then(|car| car.params.clone());
-    hub.close().await;
-    let Some(params) = params else {
-        output::complain(&format!(
-            "{car}: NO ANSWER: it has not said which set is in force"
-        ));
-        return Ok(ExitCode::from(NO_ANSWER));
+    let params = match last_said(link, car, "which set is in force", |car| car.params.clone()).await? {
+        Ok(params) => params,
+        Err(code) => return Ok(code),
     };
     if json {
         output::say_json(&params)?;
@@ -94,6 +83,29 @@ async fn get(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<Ex
         output::say(&describe(&params));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// What a car last said of something, once it has; else the exit code, when why has been told.
+async fn last_said<T>(
+    link: &LinkOptions,
+    car: &CarName,
+    of: &str,
+    find: impl Fn(&Car) -> Option<T>,
+) -> anyhow::Result<Result<T, ExitCode>> {
+    let hub = open(link).await?;
+    if !hub.wait_for(car, FIND).await {
+        return Ok(Err(no_such_car(&hub, car).await));
+    }
+    let find = |fleet: &Fleet| fleet.car(car).and_then(&find);
+    hub.wait_until(FIND, |fleet| find(fleet).is_some()).await;
+    let said = find(&hub.fleet());
+    hub.close().await;
+    Ok(said.ok_or_else(|| {
+        output::complain(&format!(
+            "{car}: NO ANSWER: it has not said {of}. Is its node older than this program?"
+        ));
+        ExitCode::from(NO_ANSWER)
+    }))
 }
 
 fn describe(params: &Params) -> String {
@@ -124,21 +136,10 @@ fn values(set: &ParameterSet) -> Vec<String> {
 
 /// How the set in the shadow compares, as the car last said it.
 async fn shadow(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(no_such_car(&hub, car).await);
-    }
-    hub.wait_until(FIND, |fleet| {
-        fleet.car(car).is_some_and(|car| car.shadow.is_some())
-    })
-    .await;
-    let shadow = hub.fleet().car(car).and_then(|car| car.shadow.clone());
-    hub.close().await;
-    let Some(shadow) = shadow else {
-        output::complain(&format!(
-            "{car}: NO ANSWER: it has not said whether a set runs in the shadow. Is its node older than this program?"
-        ));
-        return Ok(ExitCode::from(NO_ANSWER));
+    let of = "whether a set runs in the shadow";
+    let shadow = match last_said(link, car, of, |car| car.shadow.clone()).await? {
+        Ok(shadow) => shadow,
+        Err(code) => return Ok(code),
     };
     if json {
         output::say_json(&shadow)?;

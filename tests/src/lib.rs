@@ -23,7 +23,7 @@ use pitwall::{Hub, Role};
 use protocol::{Action, CarName, ParamsAction};
 
 /// How long anything may take before a test gives up.
-pub const DEADLINE: Duration = Duration::from_secs(20);
+pub const DEADLINE: Duration = Duration::from_mins(1);
 
 /// A car's name.
 pub fn named(name: &str) -> CarName {

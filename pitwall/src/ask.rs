@@ -265,8 +265,7 @@ impl Link {
     pub async fn fetch_info(&self, car: &CarName) -> Option<CarInfo> {
         let info = self
             .ask::<CarInfo>(car, Topic::Info, Vec::new(), PATIENCE)
-            .await
-            .ok()??;
+            .await?;
         self.hand_on(car, Happening::Info(info.clone()));
         Some(info)
     }
@@ -276,8 +275,7 @@ impl Link {
         let question = encode(&ClockRequest { sent: unix_now() }, stamps()).ok()?;
         let reply = self
             .ask::<ClockReply>(car, Topic::Clock, question, Duration::from_secs(1))
-            .await
-            .ok()??;
+            .await?;
         let (offset, round_trip) = reply.offset_and_round_trip(unix_now());
         self.hand_on(car, Happening::Clock { offset, round_trip });
         Some((offset, round_trip))
@@ -300,20 +298,19 @@ impl Link {
         }
     }
 
-    /// The first reply; None when there is none in time.
+    /// The first reply; None when there is none in time, or it cannot be read.
     async fn ask<M: Message>(
         &self,
         car: &CarName,
         topic: Topic,
         question: Vec<u8>,
         patience: Duration,
-    ) -> Result<Option<M>, String> {
-        match first_answer(&self.session, car, topic, question, patience, ASK_PRIORITY).await {
-            Some(bytes) => decode::<M>(&bytes)
-                .map(|(_, message)| Some(message))
-                .map_err(|e| e.to_string()),
-            None => Ok(None),
-        }
+    ) -> Option<M> {
+        let bytes = first_answer(&self.session, car, topic, question, patience, ASK_PRIORITY).await?;
+        decode::<M>(&bytes)
+            .inspect_err(|error| tracing::debug!(%car, %error, "an answer that cannot be read"))
+            .map(|(_, message)| message)
+            .ok()
     }
 }
 

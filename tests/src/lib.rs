@@ -17,10 +17,13 @@ pub use stolen::stolen;
 pub use synthetic_bag::{room, true_pose, write_bag};
 
 use std::net::TcpListener;
+use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use pitwall::{Hub, Role};
 use protocol::{Action, CarName, ParamsAction};
+use tempfile::TempDir;
 
 /// How long anything may take before a test gives up.
 pub const DEADLINE: Duration = Duration::from_mins(1);
@@ -66,6 +69,16 @@ pub fn client(endpoint: &str) -> Role {
     Role::Client {
         connect: vec![endpoint.to_owned()],
     }
+}
+
+/// A pit wall that records: where cars dial, and the folder with the file.
+pub async fn recording() -> (String, Arc<Hub>, TempDir, PathBuf) {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("session.mcap");
+    hub.start_recording(&file).await.expect("a new file");
+    (endpoint, hub, folder, file)
 }
 
 /// Waits until `condition` holds; panics with `what` when it does not within [`DEADLINE`].

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use pitwall::{Hub, Report, Verdict, read_events, unix_now};
 use protocol::{CarName, Outcome, Topic};
 use system_tests::{
-    Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, router, select, wait_until,
+    Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, recording, router, select, wait_until,
 };
 
 #[tokio::test(flavor = "multi_thread")]
@@ -129,11 +129,7 @@ async fn bytes_that_are_no_message_are_counted_and_said_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_of_three_cars_holds_every_message() {
-    let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("session.mcap");
-    hub.start_recording(&file).await.expect("a new file");
+    let (endpoint, hub, _folder, file) = recording().await;
     let mut cars = Vec::new();
     for name in ["car-1", "car-2", "car-3"] {
         cars.push(FakeCar::start(name, &endpoint, Behaviour::default()).await);
@@ -222,11 +218,7 @@ async fn a_recording_of_three_cars_holds_every_message() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
-    let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("session.mcap");
-    hub.start_recording(&file).await.expect("a new file");
+    let (endpoint, hub, _folder, _) = recording().await;
     let slow = Behaviour {
         withholds: true,
         ..Behaviour::default()

@@ -1,16 +1,15 @@
 //! From a bag to the pit wall, through every part: sensors, filter, health, network, fleet, commands, recording.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use car_node::bag::{Bag, Topics};
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::source::BagPlayer;
-use pitwall::{Happening, Hub, Verdict, read_events};
+use pitwall::{Happening, Verdict, read_events};
 use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
 use synpf::TrackMap;
-use system_tests::{DEADLINE, free_endpoint, room, router, true_pose, wait_until, write_bag};
-use tempfile::TempDir;
+use system_tests::{DEADLINE, recording, room, true_pose, wait_until, write_bag};
 
 /// Starts a car that plays the bag in `folder`.
 fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
@@ -33,16 +32,6 @@ fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
     config.begin = Begin::Pose(true_pose(0.0));
     config.connect = vec![endpoint.to_owned()];
     Node::start(config).expect("a car")
-}
-
-/// A pit wall that records: where cars dial, and the folder with the file.
-async fn recording() -> (String, Arc<Hub>, TempDir, PathBuf) {
-    let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("session.mcap");
-    hub.start_recording(&file).await.expect("a new file");
-    (endpoint, hub, folder, file)
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -170,7 +170,6 @@ fn driven(map: &Arc<TrackMap>, seed: u64) -> Localizer {
 #[test]
 fn a_car_that_jumps_with_its_odometry_is_found_where_that_has_put_it() {
     let map = ring();
-    let earlier = |stamp: Stamp, by: f64| stamp.plus(-by);
     for missing in [0.5, common::lap() / 3.0] {
         // The piece is cut out and the stamps are closed up: odometry jumps as far as the car.
         let mut localizer = driven(&map, 11);
@@ -179,12 +178,12 @@ fn a_car_that_jumps_with_its_odometry_is_found_where_that_has_put_it() {
             let at = 1.0 + 0.025 * f64::from(k);
             while odom <= at {
                 let mut message = odometry(odom + missing, 1.0);
-                message.stamp = earlier(message.stamp, missing);
+                message.stamp = message.stamp.plus(-missing);
                 localizer.on_odometry(&message).expect("sound");
                 odom += 0.02;
             }
             let mut scan = scan(&map, at + missing);
-            scan.stamp = earlier(scan.stamp, missing);
+            scan.stamp = scan.stamp.plus(-missing);
             let update = localizer.on_scan(&scan).expect("an update");
             let off = update.pose.distance(truth(at + missing));
             match k {

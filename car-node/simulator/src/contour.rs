@@ -1,11 +1,11 @@
 //! Walls from a map's cells.
 
-use maps::{OccupancyGrid, solidity};
+use maps::{CORNERS, OccupancyGrid, solidity, zero_lines};
 
 use crate::{Surface, Wall};
 
-/// The contours between free cells and all others, by marching squares (Lorensen and Cline, 1987, in two dimensions)
-/// on the free share of each 3 x 3 block of cells, so that the cells' staircase becomes a line.
+/// The contours between free cells and all others: where the free share of each 3 x 3 block of cells is one half, so that
+/// the cells' staircase becomes a line.
 ///
 /// Each wall is one segment: rays and outlines need no more order.
 pub(crate) fn contours(grid: &OccupancyGrid) -> Vec<Wall> {
@@ -39,24 +39,18 @@ pub(crate) fn contours(grid: &OccupancyGrid) -> Vec<Wall> {
     let mut walls = Vec::new();
     for row in -1..height {
         for column in -1..width {
-            // Corners of a square between four cell centres, counter-clockwise.
-            let corners = [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(dc, dr)| {
-                let (c, r) = (column + dc, row + dr);
-                ([c as f64 + 0.5, r as f64 + 0.5], at(&share, c, r) - 0.5)
-            });
-            let crossings: Vec<[f64; 2]> = (0..4)
-                .filter_map(|i| {
-                    let ((a, va), (b, vb)) = (corners[i], corners[(i + 1) % 4]);
-                    ((va < 0.0) != (vb < 0.0)).then(|| {
-                        let t = va / (va - vb);
-                        grid.to_map([a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])])
-                    })
-                })
-                .collect();
-            // Two crossings, or four at a saddle: the pairing there matters to nobody.
-            walls.extend(crossings.chunks_exact(2).map(|pair| Wall {
-                surface: Surface::Plain,
-                points: pair.to_vec(),
+            let corners =
+                CORNERS.map(|[right, up]| (at(&share, column + right as i64, row + up as i64) - 0.5) as f32);
+            walls.extend(zero_lines(corners).map(|ends| {
+                Wall {
+                    surface: Surface::Plain,
+                    points: ends
+                        .map(|end| {
+                            let [u, v] = end.at.map(f64::from);
+                            grid.to_map([column as f64 + 0.5 + u, row as f64 + 0.5 + v])
+                        })
+                        .to_vec(),
+                }
             }));
         }
     }

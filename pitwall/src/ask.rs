@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use protocol::{
-    Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Key,
+    Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Header, Key,
     LinkReport, MapReply, Message, Outcome, Stamps, Topic, decode, encode,
 };
 use serde::Serialize;
@@ -254,6 +254,7 @@ impl Link {
                 car,
                 Happening::Unreadable {
                     topic: Topic::Map,
+                    header: Header::read(&bytes).ok(),
                     error: error.to_string(),
                 },
             ),

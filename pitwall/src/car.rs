@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{
-    CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Params, Pose, ScanView,
-    Shadow, State, Telemetry, Topic, Truth,
+    CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params, Pose,
+    ScanView, Shadow, State, Telemetry, Topic, Truth,
 };
 use serde::Serialize;
 
@@ -182,9 +182,30 @@ impl Car {
             .filter(|length| *length > 0.0)
     }
 
-    /// Takes note of bytes that could not be read. True for the first of their topic.
-    pub(crate) fn refuse(&mut self, topic: Topic) -> bool {
-        self.streams.entry(topic).or_default().refuse() == 1
+    /// Takes note of bytes that could not be read, and of the header before them, if there was one, which arrived at `at`
+    /// [unix ns]. True for the first of their topic.
+    pub(crate) fn refuse(&mut self, topic: Topic, header: Option<&Header>, at: i64) -> bool {
+        if header.is_some() {
+            self.last_heard = self.last_heard.max(at);
+        }
+        self.streams.entry(topic).or_default().refuse(header) == 1
+    }
+
+    /// Why the car's state is not known although it tells it; None when it does not, or the state is known.
+    fn not_understood(&self) -> Option<String> {
+        let stream = self.streams.get(&Topic::Health)?;
+        let (version, known) = (stream.refused()?.version, Health::VERSION);
+        if version > known {
+            Some(format!(
+                "this pit wall is too old for the car: its health messages are of version {version}, and {known} is the \
+                 newest known here; update pitwall"
+            ))
+        } else {
+            // One that was damaged on its way is followed by the next.
+            let unreadable = stream.unreadable();
+            let none = self.health.is_none();
+            none.then(|| format!("no health message that can be read, of {unreadable} that came"))
+        }
     }
 
     /// Takes note of a comparison of clocks.
@@ -248,7 +269,10 @@ impl Car {
         let offset = self.clock_offset();
         let blind = self.blind(now);
         let quiet_s = seconds(now - self.last_heard).max(0.0);
-        let (state, causes) = match &self.health {
+        let not_understood = self.not_understood();
+        // What it last said that could be read may be of long ago.
+        let health = self.health.as_ref().filter(|_| not_understood.is_none());
+        let (state, causes) = match health {
             _ if blind => {
                 let gone = if self.alive {
                     ""
@@ -260,7 +284,10 @@ impl Car {
                     vec![format!("{gone}nothing heard for {quiet_s:.1} s")],
                 )
             }
-            None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
+            None => match not_understood {
+                Some(why) => ("UNKNOWN".to_owned(), vec![why]),
+                None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
+            },
             Some(health) => (
                 health.state.to_string(),
                 health.causes.iter().map(ToString::to_string).collect(),
@@ -271,10 +298,7 @@ impl Car {
             car: self.name.clone(),
             state,
             causes,
-            state_for_s: self
-                .health
-                .as_ref()
-                .map(|health| seconds(now + offset - health.since).max(0.0)),
+            state_for_s: health.map(|health| seconds(now + offset - health.since).max(0.0)),
             blind,
             alive: self.alive,
             quiet_s,
@@ -303,7 +327,7 @@ impl Car {
                     .map(|revert| seconds(revert.at - now - offset).max(0.0)),
             }),
             shadow: self.shadow.clone().filter(|shadow| shadow.set.is_some()),
-            health: self.health.clone(),
+            health: health.cloned(),
             load: self.load.clone(),
             round_trip_s: self.clock.map(|clock| seconds(clock.round_trip)),
             clock_offset_s: self.clock.map(|clock| seconds(clock.offset)),
@@ -325,7 +349,8 @@ impl Car {
 pub struct CarView {
     /// Its name.
     pub car: CarName,
-    /// The state in capitals: one of the car's own, or `BLIND` when nothing comes from it.
+    /// The state in capitals: one of the car's own, `BLIND` when nothing comes from it, or `UNKNOWN` when what it says of
+    /// its state cannot be read here.
     pub state: String,
     /// Why, in words, the worst first.
     pub causes: Vec<String>,

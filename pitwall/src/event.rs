@@ -35,10 +35,12 @@ pub enum Happening {
         /// The bytes as they came.
         bytes: Arc<[u8]>,
     },
-    /// Bytes that are no message.
+    /// Bytes that are no message, or one of a version that is not known here.
     Unreadable {
         /// Where they came in.
         topic: Topic,
+        /// The header that they begin with, if they do.
+        header: Option<Header>,
         /// What is wrong with them.
         error: String,
     },

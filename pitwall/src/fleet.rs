@@ -51,8 +51,8 @@ impl Fleet {
                     self.log.push(entry_of(event, name, when));
                 }
             }
-            Happening::Unreadable { topic, error } => {
-                let first = car.refuse(*topic);
+            Happening::Unreadable { topic, header, error } => {
+                let first = car.refuse(*topic, header.as_ref(), at);
                 if first {
                     self.log.push(LogEntry {
                         number: 0,

@@ -501,6 +501,7 @@ impl Decoding {
             },
             Some(Err(error)) => Happening::Unreadable {
                 topic: key.topic,
+                header: Header::read(&bytes).ok(),
                 error: error.to_string(),
             },
             None => return,

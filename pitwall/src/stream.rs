@@ -1,6 +1,6 @@
 //! One stream of a car: rate, age, losses.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 
 use protocol::Header;
 use serde::Serialize;
@@ -16,6 +16,11 @@ pub struct Stream {
     arrived: i64,
     newest: Option<Header>,
     unreadable: u64,
+    /// The newest message of all, where that one could not be read.
+    refused: Option<Header>,
+    /// Session and number of messages that could not be read, until one of a later number can: only that one proves that
+    /// there is such a session.
+    unproven: BTreeSet<(u64, u64)>,
     late_by: f64,
     /// Of the last second: when each arrived [unix ns], and how late [s].
     transits: VecDeque<(i64, f64)>,
@@ -38,14 +43,22 @@ const SECOND: i64 = 1_000_000_000;
 impl Stream {
     /// Messages that a rate is taken over.
     const WINDOW: usize = 64;
+    /// Messages that could not be read and are remembered by their numbers.
+    const UNPROVEN: usize = 4096;
 
     /// Takes note of a message that arrived at `at` [unix ns].
     pub fn arrive(&mut self, header: &Header, at: i64) -> Taken {
+        let order = |h: &Header| (h.session, h.sequence);
+        let later = self.unproven.split_off(&order(header));
+        for (session, sequence) in std::mem::replace(&mut self.unproven, later) {
+            if session == header.session {
+                self.gaps.arrive(session, sequence);
+            }
+        }
         let arrival = self.gaps.arrive(header.session, header.sequence);
         if arrival == Arrival::Repeated {
             return Taken::Repeated;
         }
-        let order = |h: &Header| (h.session, h.sequence);
         let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
         if newer {
             if self.newest.is_some_and(|newest| newest.session != header.session) {
@@ -57,6 +70,7 @@ impl Stream {
             self.published.push_back(header.published);
             self.arrived = at;
             self.newest = Some(*header);
+            self.refused = None;
             self.late_by = (at - header.published) as f64 * 1e-9;
             self.transits.push_back((at, self.late_by));
             while self.transits.front().is_some_and(|(then, _)| at - then > SECOND) {
@@ -66,10 +80,34 @@ impl Stream {
         if newer { Taken::Newest } else { Taken::Older }
     }
 
-    /// Takes note of bytes that could not be read; returns how many there were.
-    pub fn refuse(&mut self) -> u64 {
+    /// Takes note of bytes that could not be read; returns how many there were. What came and cannot be read is not
+    /// missing.
+    pub fn refuse(&mut self, header: Option<&Header>) -> u64 {
         self.unreadable += 1;
+        if let Some(header) = header {
+            let order = |h: &Header| (h.session, h.sequence);
+            if self.newest.is_none_or(|newest| order(header) > order(&newest)) {
+                self.refused = Some(*header);
+                self.unproven.insert(order(header));
+                if self.unproven.len() > Self::UNPROVEN {
+                    self.unproven.pop_first();
+                }
+            } else {
+                // In the present session it fills its gap; one of a session before is left alone.
+                self.gaps.arrive(header.session, header.sequence);
+            }
+        }
         self.unreadable
+    }
+
+    /// How many payloads could not be read.
+    pub fn unreadable(&self) -> u64 {
+        self.unreadable
+    }
+
+    /// The newest message of all, where that one could not be read.
+    pub fn refused(&self) -> Option<Header> {
+        self.refused
     }
 
     /// The newest message's header.
@@ -201,5 +239,30 @@ mod tests {
         );
         let view = stream.view(0, 0);
         assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
+    }
+
+    #[test]
+    fn what_came_and_cannot_be_read_is_not_missing() {
+        let mut stream = Stream::default();
+        stream.arrive(&header(1), 0);
+        stream.refuse(Some(&header(2)));
+        stream.refuse(Some(&header(3)));
+        stream.arrive(&header(6), 0);
+        stream.refuse(Some(&header(5)));
+        let view = stream.view(0, 0);
+        assert_eq!((view.received, view.missing, view.unreadable), (5, 1, 3));
+    }
+
+    #[test]
+    fn an_unreadable_header_of_nobody_stops_no_stream() {
+        let mut stream = Stream::default();
+        let mut forged = header(u64::MAX);
+        forged.session = u64::MAX;
+        for number in 1..4 {
+            stream.refuse(Some(&forged));
+            assert_eq!(stream.arrive(&header(number), 0), Taken::Newest);
+        }
+        let view = stream.view(0, 0);
+        assert_eq!((view.received, view.missing, view.sender_restarts), (3, 0, 0));
     }
 }

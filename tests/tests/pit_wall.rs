@@ -127,6 +127,31 @@ async fn bytes_that_are_no_message_are_counted_and_said_once() {
     hub.close().await;
 }
 
+/// It was INIT, "no health message yet", for ever.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pit_wall_that_is_too_old_for_a_car_says_so() {
+    let endpoint = free_endpoint();
+    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let newer = Behaviour {
+        newer: true,
+        ..Behaviour::default()
+    };
+    let car = FakeCar::start("car-1", &endpoint, newer).await;
+    let view = || hub.fleet().car(car.name()).map(|car| car.view(unix_now()));
+    wait_until("the car's messages are not understood", || {
+        view().is_some_and(|car| {
+            car.state == "UNKNOWN"
+                && car.causes[0].starts_with("this pit wall is too old for the car")
+                && car.causes[0].contains("version 99")
+        })
+    })
+    .await;
+    let view = view().expect("the car is there");
+    assert!(view.pose.is_some() && !view.blind, "what can be read is shown");
+    assert_eq!(view.streams["health"].missing, 0, "what came is not missing");
+    hub.close().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_of_three_cars_holds_every_message() {
     let (endpoint, hub, _folder, file) = recording().await;

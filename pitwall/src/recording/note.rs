@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use protocol::{CarInfo, CarName, Topic};
+use protocol::{CarInfo, CarName, Header, Topic};
 use serde::{Deserialize, Serialize};
 
 use crate::event::Happening;
@@ -13,10 +13,24 @@ use crate::event::Happening;
 pub(super) enum Note {
     Appeared,
     Vanished,
-    Unreadable { topic: Topic, error: String },
-    Info { info: CarInfo },
-    Clock { offset: i64, round_trip: i64 },
-    Marker { who: String, text: String },
+    Unreadable {
+        topic: Topic,
+        /// Recordings of before have none.
+        #[serde(default)]
+        header: Option<Header>,
+        error: String,
+    },
+    Info {
+        info: CarInfo,
+    },
+    Clock {
+        offset: i64,
+        round_trip: i64,
+    },
+    Marker {
+        who: String,
+        text: String,
+    },
 }
 
 impl Note {
@@ -42,8 +56,9 @@ impl Note {
         Some(match happening {
             Happening::Appeared => Self::Appeared,
             Happening::Vanished => Self::Vanished,
-            Happening::Unreadable { topic, error } => Self::Unreadable {
+            Happening::Unreadable { topic, header, error } => Self::Unreadable {
                 topic: *topic,
+                header: *header,
                 error: error.clone(),
             },
             Happening::Info(info) => Self::Info { info: info.clone() },
@@ -65,7 +80,7 @@ impl From<Note> for Happening {
         match note {
             Note::Appeared => Self::Appeared,
             Note::Vanished => Self::Vanished,
-            Note::Unreadable { topic, error } => Self::Unreadable { topic, error },
+            Note::Unreadable { topic, header, error } => Self::Unreadable { topic, header, error },
             Note::Info { info } => Self::Info(info),
             Note::Clock { offset, round_trip } => Self::Clock { offset, round_trip },
             Note::Marker { who, text } => Self::Marker {

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
-use protocol::{Key, MapReply, Telemetry, Topic, decode};
+use protocol::{Header, Key, MapReply, Telemetry, Topic, decode};
 
 use super::file::{RecordingError, WIRE_ENCODING};
 use super::note::Note;
@@ -101,6 +101,7 @@ fn happening(topic: Topic, data: &[u8]) -> Result<Happening, String> {
     };
     Ok(happening.unwrap_or_else(|error| Happening::Unreadable {
         topic,
+        header: Header::read(data).ok(),
         error: error.to_string(),
     }))
 }

@@ -47,7 +47,7 @@ pub struct UnreadableCount(BTreeMap<(CarName, Topic), (u64, String)>);
 impl UnreadableCount {
     /// Takes note of an event.
     pub fn take(&mut self, event: &FleetEvent) {
-        if let Happening::Unreadable { topic, error } = &event.happening {
+        if let Happening::Unreadable { topic, error, .. } = &event.happening {
             let (messages, _) = self
                 .0
                 .entry((event.car.clone(), *topic))
@@ -114,18 +114,33 @@ mod tests {
         for (number, version) in [(1, 1), (2, 99), (3, 2), (4, 99), (5, 3)] {
             recording.write(&event(number, version)).expect("written");
         }
+        // One that the pit wall that recorded could not read either.
+        let mut unread = event(6, 1);
+        if let Happening::Message { topic, header, .. } = unread.happening {
+            unread.happening = Happening::Unreadable {
+                topic,
+                header: Some(header),
+                error: "damaged".into(),
+            };
+        }
+        recording.write(&unread).expect("written");
+        recording.write(&event(8, 3)).expect("written");
         recording.finish().expect("ended");
 
         let read: Vec<_> = read_events(&path)
             .expect("opens")
             .map(|event| matches!(event.expect("goes on").happening, Happening::Message { .. }))
             .collect();
-        assert_eq!(read, [true, false, true, false, true]);
+        assert_eq!(read, [true, false, true, false, true, false, true]);
         let report = Report::of(&path).expect("a report");
         let told: Vec<_> = report.unreadable.iter().map(ToString::to_string).collect();
-        let expected = "car-1 event: 2 messages are left out, which cannot be read: Event has version 99, this program \
+        let expected = "car-1 event: 3 messages are left out, which cannot be read: Event has version 99, this program \
                         reads version 3: update the older side";
         assert_eq!(told, [expected]);
+        assert_eq!(
+            report.cars[0].missing, 1,
+            "number 7; the others are left out, not missing"
+        );
         assert!(report.to_html().contains(expected));
         let replay: Arc<Replay> = Replay::start(&path).expect("it plays");
         assert_eq!(replay.unreadable(), report.unreadable);

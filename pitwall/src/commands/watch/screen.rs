@@ -405,6 +405,7 @@ fn shape_of(state: &str) -> &'static str {
         "RELOCALIZING" => "↻",
         "CONVERGING" => "◐",
         "BLIND" => "□",
+        "UNKNOWN" => "?",
         _ => "○",
     }
 }

@@ -11,6 +11,7 @@ export const STATES = {
   LOST: ["✖", "bad", "the pose is wrong"],
   RELOCALIZING: ["↻", "busy", "searching the whole map"],
   STALE: ["■", "bad", "no sensor data on the car"],
+  UNKNOWN: ["?", "none", "the pit wall cannot read what the car says of it"],
   BLIND: ["□", "none", "nothing comes from the car"],
 };
 

@@ -20,6 +20,10 @@ use zenoh::{Config, Session};
 
 /// What a fake car does wrong.
 #[derive(Debug, Clone, Copy, Default)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a fault of its own, and they go together"
+)]
 pub struct Behaviour {
     /// It does not answer commands.
     pub mute: bool,

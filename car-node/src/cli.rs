@@ -158,6 +158,10 @@ pub(crate) struct Bags {
     /// ROS 2 bag (MCAP); may be repeated.
     #[arg(long = "bag", value_name = "FILE.mcap", required = true, num_args = 1..)]
     pub(crate) files: Vec<PathBuf>,
+    /// True poses, in place of a topic of the bag (one bag): CSV with stamp_s,x_m,y_m,heading_rad of base_link, as --poses
+    /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad.
+    #[arg(long, value_name = "FILE.csv", conflicts_with = "truth_topic")]
+    pub(crate) truth: Option<PathBuf>,
     /// Which topics of the bags to take.
     #[command(flatten, next_help_heading = "Topics of the bags")]
     pub(crate) topics: TopicArguments,

@@ -226,6 +226,15 @@ fn a_drive_is_localized_measured_and_repeatable() {
     assert_eq!(lines.count() as u64, updates);
     assert!(text.contains("\n1700000000.050000000,"), "stamps are the scans'");
 
+    // Held against its own poses it is right, and started from them too.
+    let own = poses.to_str().expect("UTF-8");
+    let output = evaluate(&map, &bag, &["--truth", own, "--initial-pose", "truth", "--json"]);
+    let held: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    assert!(
+        held["position_error_m"]["max"].as_f64().expect("truth") < 0.02,
+        "{held}"
+    );
+
     let again = folder.path().join("again.csv");
     run(&again);
     assert_eq!(
@@ -265,6 +274,10 @@ fn what_is_wrong_is_named() {
     fails(1, &map, here, &[], &["is a folder", ".mcap"]);
     fails(1, &map, &cut, &[], &["cut.mcap: ", "mcap recover"]);
     fails(1, &bag, &bag, &[], &["not a text file"]);
+    let poses = here.join("truth.csv");
+    fs::write(&poses, "stamp_s,x,y,heading_rad\n").expect("writes");
+    let truth = ["--truth", poses.to_str().expect("UTF-8")];
+    fails(1, &map, &bag, &truth, &["truth.csv: no columns", "laser_x_m"]);
     // A fault of the call.
     fails(
         2,

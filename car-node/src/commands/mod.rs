@@ -21,6 +21,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use car_node::bag::{Bag, SensorLog, Topics};
+use car_node::evaluate::read_poses;
 use car_node::frames::Mount;
 use car_node::sets::{self, NamedSet, SetError};
 use maps::{MapError, OccupancyGrid};
@@ -47,8 +48,21 @@ pub(crate) struct BadUsage(String);
 
 /// Reads what a localizer needs of each bag.
 fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
+    if bags.truth.is_some() && bags.files.len() > 1 {
+        bail!(BadUsage(
+            "--truth has the poses of one drive: give one --bag".into()
+        ));
+    }
     let files = bags.files.iter().map(PathBuf::as_path);
-    files.map(|bag| Ok((bag, read_bag(bag, &bags.topics)?))).collect()
+    let with_truth = |bag| {
+        let mut log = read_bag(bag, &bags.topics)?;
+        if let Some(truth) = &bags.truth {
+            let mount = log.mount.unwrap_or_else(Mount::typical);
+            log.truth = read_poses(truth, mount.base_link_from_laser)?;
+        }
+        Ok((bag, log))
+    };
+    files.map(with_truth).collect()
 }
 
 /// Reads what a localizer needs of a bag.

@@ -4,6 +4,7 @@
 pub mod ablation;
 mod errors;
 mod faults;
+mod pose_file;
 mod states;
 mod statistics;
 mod truth;
@@ -17,6 +18,7 @@ use synpf::{Dropped, Localizer, SetUpError, Stamp, Update};
 
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
+pub use pose_file::{PoseFileError, read_poses};
 pub use states::{FaultReport, StateChange, StateTruth, States};
 pub use statistics::{ErrorSummary, mean, percentile};
 pub use truth::Truth;
@@ -96,7 +98,7 @@ pub struct Outcome {
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
     /// There is no truth to start from.
-    #[error("the true pose at the first scan is not in the bag; give --initial-pose x,y,heading")]
+    #[error("the true pose at the first scan is not known; give --initial-pose x,y,heading")]
     NoTruth,
     /// The pose to start from is refused.
     #[error(transparent)]

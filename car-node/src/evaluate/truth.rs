@@ -13,6 +13,9 @@ pub struct Truth {
 /// Across a longer gap the truth is not known well enough to hold an estimate against it [s].
 const LONGEST_GAP: f64 = 0.2;
 
+/// Stamps that a text file gives may be rounded by so much [s].
+const ROUNDING: f64 = 1e-6;
+
 impl Truth {
     /// From samples in any order. Of two with one stamp the first counts; those that are not finite do not.
     pub fn new(mut samples: Vec<(Stamp, Pose)>) -> Self {
@@ -31,7 +34,7 @@ impl Truth {
     pub fn at(&self, stamp: Stamp) -> Option<Pose> {
         let next = self.samples.partition_point(|(sample, _)| *sample < stamp);
         let &(later, end) = self.samples.get(next)?;
-        if later == stamp {
+        if later.since(stamp) < ROUNDING {
             return Some(end);
         }
         let (earlier, start) = *self.samples.get(next.checked_sub(1)?)?;

@@ -99,7 +99,7 @@ pub(crate) struct Run {
     /// The car's name on the network.
     #[arg(long, value_name = "NAME", default_value = "car-1")]
     pub(crate) car: CarName,
-    /// Play a bag this many times as fast.
+    /// Play a bag this many times as fast, 0.01 to 1000.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
     pub(crate) rate: f64,
     /// Pit wall to dial, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or found by
@@ -129,23 +129,26 @@ pub(crate) struct Run {
     pub(crate) topics: TopicArguments,
 }
 
+/// Over the topics, whatever else a command takes after them.
+const TOPICS: &str = "Topics";
+
 /// Which topics of a bag, or of a live car, to take, and what they do not say.
 #[derive(Debug, Args)]
 pub(crate) struct TopicArguments {
     /// Laser scans (sensor_msgs/LaserScan) [default: what is there].
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) scan_topic: Option<String>,
     /// Wheel odometry (nav_msgs/Odometry) [default: what is there, fused odometry first].
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) odom_topic: Option<String>,
     /// True poses (nav_msgs/Odometry or geometry_msgs/PoseStamped) [default: /ground_truth/odom, if there].
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) truth_topic: Option<String>,
     /// Gyroscope (sensor_msgs/Imu) [default: what is there, if any].
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
     /// Pose of the laser on base_link [m, m, rad] [default: by /tf_static; 0.27 m ahead without it].
-    #[arg(long, value_name = "X,Y,HEADING", value_parser = laser, allow_hyphen_values = true)]
+    #[arg(long, help_heading = TOPICS, value_name = "X,Y,HEADING", value_parser = laser, allow_hyphen_values = true)]
     pub(crate) laser: Option<Pose>,
 }
 
@@ -163,7 +166,7 @@ pub(crate) struct Bags {
     #[arg(long, value_name = "FILE.csv", conflicts_with = "truth_topic")]
     pub(crate) truth: Option<PathBuf>,
     /// Which topics of the bags to take.
-    #[command(flatten, next_help_heading = "Topics of the bags")]
+    #[command(flatten)]
     pub(crate) topics: TopicArguments,
 }
 
@@ -227,10 +230,10 @@ pub(crate) struct Race {
     /// it is slowed to what the simulated car can do.
     #[arg(long, value_name = "FILE")]
     pub(crate) raceline: Option<PathBuf>,
-    /// Laps for every car.
+    /// Laps for every car, 1 to 10000.
     #[arg(long, value_name = "N", default_value = "10", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) laps: u32,
-    /// Grip: hq (26 N of lateral pull) or lq (19 N: the tyres slip, and odometry lies).
+    /// Grip of the tyres.
     #[arg(long, value_enum, default_value = "hq")]
     pub(crate) odometry: Odometry,
     /// Parameter set of the filter: hq, lq, adaptive, synpf-baseline, or a YAML file.
@@ -239,19 +242,19 @@ pub(crate) struct Race {
     /// What tells the driver where the car is.
     #[arg(long, value_enum, default_value = "synpf")]
     pub(crate) localizer: Guide,
-    /// Cars on the track, each with a localizer of its own.
+    /// Cars on the track, each with a localizer of its own, 1 to 20.
     #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=20))]
     pub(crate) cars: u8,
-    /// Races to run, with seeds 0, 1, 2, ...
+    /// Races to run, each with the next seed, 1 to 1000.
     #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub(crate) seeds: u64,
-    /// First seed.
+    /// Seed of the first race.
     #[arg(long, value_name = "N", default_value = "0")]
     pub(crate) seed: u64,
-    /// Speed over the raceline's own.
+    /// Speed over the raceline's own, 0.1 to 2.
     #[arg(long, value_name = "FACTOR", default_value = "1.0", value_parser = speed)]
     pub(crate) speed: f64,
-    /// Run the paper's grid (every localizer on both tyres) and print it beside the paper's table I.
+    /// Run the paper's grid (every localizer on both tyres) and print it beside table I of the paper.
     #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars"])]
     pub(crate) table: bool,
     /// One JSON object on stdout; an array of rows with --table.
@@ -291,10 +294,10 @@ pub(crate) enum TrackCommand {
         /// Description to make it from [default: a random one].
         #[arg(long, value_name = "TRACK.yaml", conflicts_with_all = ["length", "width", "seed"])]
         from: Option<PathBuf>,
-        /// Length of a random track's lap, about [m].
+        /// Length of a random track's lap, about [m], 20 to 500.
         #[arg(long, value_name = "METRES", default_value = "50", value_parser = lap_length)]
         length: f64,
-        /// Width of a random track [m].
+        /// Width of a random track [m], 1.2 to 6.
         #[arg(long, value_name = "METRES", default_value = "2", value_parser = track_width)]
         width: f64,
         /// Seed of a random track.
@@ -324,7 +327,7 @@ pub(crate) enum TrackCommand {
         /// Write an SVG file: walls, map and raceline coloured by speed.
         #[arg(long, value_name = "FILE.svg")]
         svg: Option<PathBuf>,
-        /// Columns to draw in.
+        /// Columns to draw in, 20 to 400.
         #[arg(long, value_name = "N", default_value = "100", value_parser = clap::value_parser!(u16).range(20..=400))]
         columns: u16,
     },

@@ -18,16 +18,16 @@ use pitwall::{PageOptions, PitWall, Role, WallOptions};
 #[command(name = "demo", version)]
 struct Options {
     /// Track: club, hall, park or mirror, or a folder with map.yaml and raceline.csv.
-    #[arg(long, default_value = "club")]
+    #[arg(long, value_name = "NAME|FOLDER", default_value = "club")]
     track: String,
-    /// Number of cars.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=10))]
+    /// Number of cars, 1 to 10.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=10))]
     cars: u8,
     /// Parameter set that the cars start with.
-    #[arg(long, default_value = "hq")]
+    #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     params: String,
     /// Seed of the race.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
     /// End after this long, such as 30s or 5m; without it, Ctrl-C ends the demo.
     #[arg(long = "for", value_name = "TIME", value_parser = show::duration)]

@@ -17,7 +17,7 @@ pub(crate) struct Cli {
     #[command(flatten)]
     pub(crate) link: LinkOptions,
     /// Write JSON on stdout instead of text.
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = GLOBAL)]
     pub(crate) json: bool,
     #[command(flatten)]
     pub(crate) page: Page,
@@ -30,7 +30,7 @@ pub(crate) struct Page {
     /// Where the page is served. On any but a loopback address it asks for the token that is printed.
     #[arg(
         long = "page",
-        global = true,
+        global = true, help_heading = GLOBAL,
         value_name = "ADDRESS:PORT",
         default_value = "127.0.0.1:7448"
     )]
@@ -48,6 +48,9 @@ pub(crate) struct Page {
     pub(crate) rerun_connect: Option<String>,
 }
 
+/// Over the options that every command takes, apart from its own.
+const GLOBAL: &str = "Global options";
+
 const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \
 none does, this program listens for the cars itself, on tcp/0.0.0.0:7447, while it runs.
 
@@ -56,13 +59,13 @@ Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 
 #[derive(Debug, Args)]
 pub(crate) struct LinkOptions {
     /// Listen for cars here, as tcp/ADDRESS:PORT; may be given several times.
-    #[arg(long, global = true, value_name = "ENDPOINT", value_parser = endpoint)]
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) listen: Vec<String>,
     /// Join a running pit wall or router there.
-    #[arg(long, global = true, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
     /// Your name, as the cars and the others at the pit wall see it; $USER unless given.
-    #[arg(long, global = true, value_name = "NAME")]
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "NAME")]
     operator: Option<String>,
 }
 
@@ -82,7 +85,7 @@ pub(crate) enum Verb {
     /// List the cars: state and cause, set in force, rates, ages, losses.
     Cars {
         /// How long to listen before the list is written.
-        #[arg(long, default_value = "2s", value_parser = duration)]
+        #[arg(long, value_name = "TIME", default_value = "2s", value_parser = duration)]
         wait: Duration,
     },
     /// Follow the cars on a whole screen, with the switch; as plain lines where stdout is no terminal.
@@ -125,7 +128,7 @@ pub(crate) enum Verb {
         /// The car.
         car: CarName,
         /// On or off.
-        #[arg(value_parser = on_off, action = clap::ArgAction::Set)]
+        #[arg(value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
         on: bool,
     },
     /// List what happened.
@@ -135,7 +138,7 @@ pub(crate) enum Verb {
         /// Go on until interrupted.
         #[arg(long, short)]
         follow: bool,
-        /// With --follow: wait so long for a car that is not there yet.
+        /// With --follow: wait so long for a car to appear.
         #[arg(long, value_name = "TIME", default_value = "10m", value_parser = duration)]
         wait: Duration,
     },
@@ -153,7 +156,7 @@ pub(crate) enum Verb {
         /// The recording.
         file: PathBuf,
         /// Times real time, 0.1 to 50.
-        #[arg(long, default_value = "1", value_parser = speed)]
+        #[arg(long, value_name = "FACTOR", default_value = "1", value_parser = speed)]
         speed: f64,
         /// Begin here, as 90s or 5m.
         #[arg(long, value_name = "TIME", default_value = "0s", value_parser = duration)]

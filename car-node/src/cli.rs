@@ -78,7 +78,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "ENDPOINT", default_value = Ros2Options::ENDPOINT, value_parser = endpoint)]
     pub(crate) ros: String,
     /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 0, 232))]
     pub(crate) ros_domain: Option<u32>,
     /// With --source ros2: where to publish the pose for the car's own nodes (nav_msgs/Odometry in frame map).
     #[arg(long, value_name = "TOPIC", default_value = ros_pose::TOPIC)]
@@ -100,7 +100,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "NAME", default_value = "car-1")]
     pub(crate) car: CarName,
     /// Play a bag this many times as fast, 0.01 to 1000.
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = rate)]
     pub(crate) rate: f64,
     /// Pit wall to dial, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or found by
     /// multicast].
@@ -119,7 +119,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "FOLDER")]
     pub(crate) state: Option<PathBuf>,
     /// Seed of the filter's and the simulator's random numbers.
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: u64,
     /// Grip of the simulated car.
     #[arg(long, value_enum, default_value = "hq")]
@@ -183,13 +183,13 @@ pub(crate) struct Evaluate {
     #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true)]
     pub(crate) initial_pose: Option<Start>,
     /// Seed of the filter's random numbers; may be repeated, or a list: 0,1,2.
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0")]
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: Vec<u64>,
     /// Do something to the log first, and tell what the health state said to it: kidnap@20+4 carries the car on by
     /// 4 s of driving, 20 s after the first scan, and hides it from odometry; splice@20+4 cuts the same piece out and leaves
     /// odometry as it was logged, as in a bag that was edited; so do no-scans, no-odometry, blocked (an opponent ahead) and
     /// black-tubes; may be repeated.
-    #[arg(long, value_name = "KIND@S+S")]
+    #[arg(long, value_name = "KIND@S+S", allow_hyphen_values = true)]
     pub(crate) fault: Vec<Fault>,
     /// Write `stamp_s,x_m,y_m,heading_rad` of base_link at every update to this CSV file (one bag, one seed).
     #[arg(long, value_name = "OUT.csv")]
@@ -213,7 +213,7 @@ pub(crate) struct Ablate {
     #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true, default_value = "truth")]
     pub(crate) initial_pose: Start,
     /// Seeds to take the mean over, as a list: 0,1,2.
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0,1,2")]
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0,1,2", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: Vec<u64>,
     /// A JSON array of rows on stdout.
     #[arg(long)]
@@ -231,7 +231,7 @@ pub(crate) struct Race {
     #[arg(long, value_name = "FILE")]
     pub(crate) raceline: Option<PathBuf>,
     /// Laps for every car, 1 to 10000.
-    #[arg(long, value_name = "N", default_value = "10", value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    #[arg(long, value_name = "N", default_value = "10", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 1, 10_000))]
     pub(crate) laps: u32,
     /// Grip of the tyres.
     #[arg(long, value_enum, default_value = "hq")]
@@ -243,16 +243,16 @@ pub(crate) struct Race {
     #[arg(long, value_enum, default_value = "synpf")]
     pub(crate) localizer: Guide,
     /// Cars on the track, each with a localizer of its own, 1 to 20.
-    #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=20))]
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = |text: &str| whole::<u8>(text, 1, 20))]
     pub(crate) cars: u8,
     /// Races to run, each with the next seed, 1 to 1000.
-    #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u64).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = |text: &str| whole::<u64>(text, 1, 1000))]
     pub(crate) seeds: u64,
     /// Seed of the first race.
-    #[arg(long, value_name = "N", default_value = "0")]
+    #[arg(long, value_name = "N", default_value = "0", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: u64,
     /// Speed over the raceline's own, 0.1 to 2.
-    #[arg(long, value_name = "FACTOR", default_value = "1.0", value_parser = speed)]
+    #[arg(long, value_name = "FACTOR", default_value = "1.0", allow_negative_numbers = true, value_parser = speed)]
     pub(crate) speed: f64,
     /// Run the paper's grid (every localizer on both tyres) and print it beside table I of the paper.
     #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars"])]
@@ -295,13 +295,13 @@ pub(crate) enum TrackCommand {
         #[arg(long, value_name = "TRACK.yaml", conflicts_with_all = ["length", "width", "seed"])]
         from: Option<PathBuf>,
         /// Length of a random track's lap, about [m], 20 to 500.
-        #[arg(long, value_name = "METRES", default_value = "50", value_parser = lap_length)]
+        #[arg(long, value_name = "METRES", default_value = "50", allow_negative_numbers = true, value_parser = lap_length)]
         length: f64,
         /// Width of a random track [m], 1.2 to 6.
-        #[arg(long, value_name = "METRES", default_value = "2", value_parser = track_width)]
+        #[arg(long, value_name = "METRES", default_value = "2", allow_negative_numbers = true, value_parser = track_width)]
         width: f64,
         /// Seed of a random track.
-        #[arg(long, value_name = "N", default_value = "0")]
+        #[arg(long, value_name = "N", default_value = "0", allow_negative_numbers = true, value_parser = seed)]
         seed: u64,
         /// Overwrite what is there.
         #[arg(long)]
@@ -328,7 +328,7 @@ pub(crate) enum TrackCommand {
         #[arg(long, value_name = "FILE.svg")]
         svg: Option<PathBuf>,
         /// Columns to draw in, 20 to 400.
-        #[arg(long, value_name = "N", default_value = "100", value_parser = clap::value_parser!(u16).range(20..=400))]
+        #[arg(long, value_name = "N", default_value = "100", allow_negative_numbers = true, value_parser = |text: &str| whole::<u16>(text, 20, 400))]
         columns: u16,
     },
 }
@@ -348,9 +348,20 @@ pub(crate) struct TrackArguments {
 fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if (least..=most).contains(&value) => Ok(value),
-        Ok(value) => Err(format!("{value} should lie in [{least}, {most}]")),
-        Err(error) => Err(error.to_string()),
+        _ => Err(format!("wanted is a number from {least} to {most}")),
     }
+}
+
+/// A whole number within a range, or what the range is.
+fn whole<T: TryFrom<u64>>(text: &str, least: u64, most: u64) -> Result<T, String> {
+    let value = text.parse().ok().filter(|value| (least..=most).contains(value));
+    value
+        .and_then(|value| value.try_into().ok())
+        .ok_or_else(|| format!("wanted is a whole number from {least} to {most}"))
+}
+
+fn seed(text: &str) -> Result<u64, String> {
+    whole(text, 0, u64::MAX)
 }
 
 fn speed(text: &str) -> Result<f64, String> {
@@ -433,6 +444,33 @@ mod tests {
         assert_eq!(pose("1,2,NaN"), Err("not finite".into()));
         assert_eq!(start("truth"), Ok(Start::Truth));
         assert!(laser("0.27,0,0").is_ok() && laser("270,0,0").is_err());
+    }
+
+    #[test]
+    fn a_negative_number_is_refused_by_its_option() {
+        let bags = "--map m.yaml --bag b.mcap";
+        for (call, option) in [
+            ("race --seed -1", "--seed"),
+            ("race --laps -1", "--laps"),
+            ("race --cars -1", "--cars"),
+            ("race --seeds -1", "--seeds"),
+            ("race --speed -1", "--speed"),
+            (&format!("evaluate {bags} --seed -1"), "--seed"),
+            (&format!("evaluate {bags} --seed 0,-1"), "--seed"),
+            (&format!("ablate {bags} --seed -1"), "--seed"),
+            ("track new folder --length -1", "--length"),
+            ("track new folder --width -1", "--width"),
+            ("track new folder --seed -1", "--seed"),
+            ("track draw club --columns -1", "--columns"),
+            ("run --source simulator --map club --seed -1", "--seed"),
+            ("run --source simulator --map club --rate -1", "--rate"),
+            ("run --source ros2 --map club --ros-domain -1", "--ros-domain"),
+        ] {
+            let error = Cli::try_parse_from(["car-node"].into_iter().chain(call.split(' ')));
+            let said = error.expect_err(call).to_string();
+            assert!(said.contains(&format!("'-1' for '{option} ")), "{call}: {said}");
+            assert!(said.contains("number from"), "{call}: {said}");
+        }
     }
 
     #[test]

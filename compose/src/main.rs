@@ -21,16 +21,16 @@ struct Options {
     #[arg(long, value_name = "NAME|FOLDER", default_value = "club")]
     track: String,
     /// Number of cars, 1 to 10.
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=10))]
+    #[arg(long, value_name = "N", default_value_t = 3, allow_negative_numbers = true, value_parser = clap::value_parser!(u8).range(1..=10))]
     cars: u8,
     /// Parameter set that the cars start with.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     params: String,
     /// Seed of the race.
-    #[arg(long, value_name = "N", default_value_t = 1)]
+    #[arg(long, value_name = "N", default_value_t = 1, allow_negative_numbers = true, value_parser = show::seed)]
     seed: u64,
     /// End after this long, such as 30s or 5m; without it, Ctrl-C ends the demo.
-    #[arg(long = "for", value_name = "TIME", value_parser = show::duration)]
+    #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = show::duration)]
     time: Option<Duration>,
     /// Where the pit wall listens for cars.
     #[arg(long, value_name = "ENDPOINT", default_value = pitwall::LOCAL_WALL)]

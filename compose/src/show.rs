@@ -171,16 +171,21 @@ fn list(cars: &[CarView]) -> String {
 /// `30s`, `5m`, or plain seconds.
 pub(crate) fn duration(text: &str) -> Result<Duration, String> {
     let (number, unit) = text.split_at(text.find(|c: char| c.is_alphabetic()).unwrap_or(text.len()));
+    let number: f64 = number
+        .parse()
+        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
     let scale = match unit {
         "" | "s" => 1.0,
         "m" | "min" => 60.0,
         "h" => 3600.0,
         _ => return Err(format!("unknown unit {unit:?}; use s, m or h")),
     };
-    let number: f64 = number
-        .parse()
-        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
-    Duration::try_from_secs_f64(number * scale).map_err(|error| format!("{text:?}: {error}"))
+    Duration::try_from_secs_f64(number * scale).map_err(|_| "a time is 0 s or more".to_owned())
+}
+
+pub(crate) fn seed(text: &str) -> Result<u64, String> {
+    text.parse()
+        .map_err(|_| format!("wanted is a whole number from 0 to {}", u64::MAX))
 }
 
 #[cfg(test)]

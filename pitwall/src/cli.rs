@@ -85,7 +85,7 @@ pub(crate) enum Verb {
     /// List the cars: state and cause, set in force, rates, ages, losses.
     Cars {
         /// How long to listen before the list is written.
-        #[arg(long, value_name = "TIME", default_value = "2s", value_parser = duration)]
+        #[arg(long, value_name = "TIME", default_value = "2s", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
     /// Follow the cars on a whole screen, with the switch; as plain lines where stdout is no terminal.
@@ -93,13 +93,13 @@ pub(crate) enum Verb {
         /// The car to begin with; without a terminal, the only one to be told of.
         car: Option<CarName>,
         /// Stop after this time.
-        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
         time: Option<Duration>,
-        /// Views per second; 10 on a terminal, else 1.
-        #[arg(long, value_name = "HZ")]
+        /// Views per second, 0.01 to 100; 10 on a terminal, else 1.
+        #[arg(long, value_name = "HZ", allow_negative_numbers = true, value_parser = views)]
         rate: Option<f64>,
         /// Wait so long for a car that is not there yet.
-        #[arg(long, value_name = "TIME", default_value = "10m", value_parser = duration)]
+        #[arg(long, value_name = "TIME", default_value = "10m", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
     /// Look at a car's parameter sets, or change the one in force.
@@ -139,7 +139,7 @@ pub(crate) enum Verb {
         #[arg(long, short)]
         follow: bool,
         /// With --follow: wait so long for a car to appear.
-        #[arg(long, value_name = "TIME", default_value = "10m", value_parser = duration)]
+        #[arg(long, value_name = "TIME", default_value = "10m", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
     /// Record all cars into an MCAP file, until interrupted.
@@ -148,7 +148,7 @@ pub(crate) enum Verb {
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
         /// Stop after this time.
-        #[arg(long = "for", value_name = "TIME", value_parser = duration)]
+        #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
         time: Option<Duration>,
     },
     /// Serve the page from a recording, as if the cars were there.
@@ -156,10 +156,10 @@ pub(crate) enum Verb {
         /// The recording.
         file: PathBuf,
         /// Times real time, 0.1 to 50.
-        #[arg(long, value_name = "FACTOR", default_value = "1", value_parser = speed)]
+        #[arg(long, value_name = "FACTOR", default_value = "1", allow_negative_numbers = true, value_parser = speed)]
         speed: f64,
         /// Begin here, as 90s or 5m.
-        #[arg(long, value_name = "TIME", default_value = "0s", value_parser = duration)]
+        #[arg(long, value_name = "TIME", default_value = "0s", allow_hyphen_values = true, value_parser = duration)]
         at: Duration,
     },
     /// Tell what a recording says: laps, sectors, alignment, load, true error; with figures as one HTML file.
@@ -245,7 +245,7 @@ pub(crate) enum ParamsVerb {
 #[derive(Debug, Args)]
 pub(crate) struct Change {
     /// Fall back by itself after this time unless confirmed.
-    #[arg(long, value_name = "TIME", value_parser = duration)]
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
     pub(crate) revert_after: Option<Duration>,
     #[command(flatten)]
     pub(crate) expect: Expect,
@@ -254,7 +254,7 @@ pub(crate) struct Change {
 #[derive(Debug, Args)]
 pub(crate) struct Expect {
     /// Only if the set in force has this revision.
-    #[arg(long, value_name = "REVISION")]
+    #[arg(long, value_name = "REVISION", allow_negative_numbers = true, value_parser = revision)]
     pub(crate) expect: Option<u64>,
 }
 
@@ -268,7 +268,7 @@ pub(crate) struct Place {
     #[arg(long)]
     pub(crate) global: bool,
     /// Take this candidate of the last search.
-    #[arg(long, value_name = "N", conflicts_with = "global")]
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = candidate, conflicts_with = "global")]
     pub(crate) pick: Option<u32>,
 }
 
@@ -295,6 +295,10 @@ pub(crate) struct RateOptions {
 fn duration(text: &str) -> Result<Duration, String> {
     let split = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
     let (number, unit) = text.split_at(split);
+    let number: f64 = number
+        .trim()
+        .parse()
+        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
     let scale = match unit {
         "ms" => 1e-3,
         "" | "s" => 1.0,
@@ -302,11 +306,23 @@ fn duration(text: &str) -> Result<Duration, String> {
         "h" => 3600.0,
         _ => return Err(format!("unknown unit {unit:?}; use ms, s, m or h")),
     };
-    let number: f64 = number
-        .trim()
-        .parse()
-        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
-    Duration::try_from_secs_f64(number * scale).map_err(|error| format!("{text:?}: {error}"))
+    Duration::try_from_secs_f64(number * scale).map_err(|_| "a time is 0 s or more".to_owned())
+}
+
+/// Views per second.
+fn views(text: &str) -> Result<f64, String> {
+    let views = text.parse().ok().filter(|rate| (0.01..=100.0).contains(rate));
+    views.ok_or_else(|| "wanted is a number from 0.01 to 100".to_owned())
+}
+
+fn candidate(text: &str) -> Result<u32, String> {
+    let number = text.parse().ok().filter(|number| *number > 0);
+    number.ok_or_else(|| "candidates are numbered 1, 2, 3 and so on".to_owned())
+}
+
+fn revision(text: &str) -> Result<u64, String> {
+    text.parse()
+        .map_err(|_| "a revision is a whole number, as `pitwall params CAR` tells it".to_owned())
 }
 
 fn speed(text: &str) -> Result<f64, String> {
@@ -366,6 +382,28 @@ mod tests {
         assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
         for text in ["", "s", "-1s", "1y", "NaN"] {
             assert!(duration(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_negative_number_is_refused_by_its_option() {
+        for (call, option) in [
+            ("record -o a.mcap --for -1s", "--for"),
+            ("watch --for -1s", "--for"),
+            ("watch --rate -1", "--rate"),
+            ("watch car-1 --wait -1s", "--wait"),
+            ("events --wait -1s", "--wait"),
+            ("cars --wait -1s", "--wait"),
+            ("replay a.mcap --speed -1", "--speed"),
+            ("replay a.mcap --at -1s", "--at"),
+            ("locate car-1 --pick -1", "--pick"),
+            ("params car-1 select hq --expect -1", "--expect"),
+            ("params car-1 select hq --revert-after -1s", "--revert-after"),
+            ("rates car-1 --pose -1", "--pose"),
+        ] {
+            let error = Cli::try_parse_from(["pitwall"].into_iter().chain(call.split(' ')));
+            let said = error.expect_err(call).to_string();
+            assert!(said.contains(&format!("for '{option} ")), "{call}: {said}");
         }
     }
 

@@ -24,10 +24,7 @@ pub(super) async fn run(
 ) -> anyhow::Result<ExitCode> {
     let screen = !json && output::on_terminal();
     let rate = rate.unwrap_or(if screen { 10.0 } else { 1.0 });
-    let period = Duration::try_from_secs_f64(1.0 / rate)
-        .ok()
-        .filter(|period| !period.is_zero())
-        .ok_or_else(|| anyhow::anyhow!("--rate {rate}: not a rate"))?;
+    let period = Duration::from_secs_f64(1.0 / rate);
     let hub = open(link).await?;
     if let Some(car) = &car
         && !await_car(&hub, car, patience).await

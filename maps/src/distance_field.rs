@@ -12,7 +12,7 @@
 
 use rayon::prelude::*;
 
-use crate::faces::{Faces, nearest_cells};
+use crate::faces::{Faces, NONE, nearest_cells};
 use crate::marching_squares::{CORNERS, Crossing, zero_lines};
 use crate::{Cell, OccupancyGrid, Pose};
 
@@ -293,10 +293,16 @@ fn distances(grid: &OccupancyGrid, wanted: impl Fn(usize) -> bool + Sync) -> Vec
     let width = grid.width;
     let far = (width + grid.height) as f32;
     let nearest = nearest_cells(width, grid.height, wanted);
-    let distance = |(i, cell): (usize, Option<[u32; 2]>)| {
-        cell.map_or(far, |[column, row]| {
-            (column as f32 - (i % width) as f32).hypot(row as f32 - (i / width) as f32)
-        })
+    let distance = |(i, cell): (usize, u32)| {
+        if cell == NONE {
+            return far;
+        }
+        let cell = cell as usize;
+        let [columns, rows] = [
+            (cell % width).abs_diff(i % width),
+            (cell / width).abs_diff(i / width),
+        ];
+        (columns as f32).hypot(rows as f32)
     };
     nearest.into_iter().enumerate().map(distance).collect()
 }

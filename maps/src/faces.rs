@@ -79,12 +79,14 @@ impl Faces {
         let found: Vec<(f32, u32)> = seeds
             .par_iter()
             .enumerate()
-            .map(|(i, seed)| {
-                let seed = seed.map(|cell| cell.map(|index| index as usize));
-                let around = seed.into_iter().flat_map(|cell| self.around(cell));
-                around
+            .map(|(i, &seed)| {
+                if seed == NONE {
+                    return (far, NONE);
+                }
+                let seed = seed as usize;
+                self.around([seed % self.width, seed / self.width])
                     .flatten()
-                    .fold((far, u32::MAX), |best, segment| nearer(i, best, segment))
+                    .fold((far, NONE), |best, segment| nearer(i, best, segment))
             })
             .collect();
         // ...or one that a neighbour has found.
@@ -94,7 +96,7 @@ impl Faces {
             for row in row.saturating_sub(1)..(row + 2).min(self.height) {
                 for column in column.saturating_sub(1)..(column + 2).min(self.width) {
                     let (_, segment) = found[row * self.width + column];
-                    if segment != best.1 && segment != u32::MAX {
+                    if segment != best.1 && segment != NONE {
                         best = nearer(i, best, segment);
                     }
                 }
@@ -147,50 +149,48 @@ fn squared_distance(point: [f32; 2], &[from, to]: &Segment) -> f32 {
     dx * dx + dy * dy
 }
 
-/// For each cell of a grid, the nearest cell that is `wanted`, as column and row; None if there is none at all (exact:
-/// Felzenszwalb and Huttenlocher, Theory of Computing 8, 2012).
-pub(crate) fn nearest_cells(
-    width: usize,
-    height: usize,
-    wanted: impl Fn(usize) -> bool + Sync,
-) -> Vec<Option<[u32; 2]>> {
-    // The nearest in a cell's own row...
-    let mut in_row = vec![None; width * height];
+/// In place of a cell's index: there is none.
+pub(crate) const NONE: u32 = u32::MAX;
+
+/// For each cell of a grid, row by row, the index of the nearest cell that is `wanted`; [`NONE`] if there is none at all
+/// (exact: Felzenszwalb and Huttenlocher, Theory of Computing 8, 2012).
+pub(crate) fn nearest_cells(width: usize, height: usize, wanted: impl Fn(usize) -> bool + Sync) -> Vec<u32> {
+    // The column of the nearest in a cell's own row...
+    let mut in_row = vec![NONE; width * height];
     in_row
         .par_chunks_mut(width.max(1))
         .enumerate()
         .for_each(|(row, nearest)| {
-            let mut last = None;
+            let mut last = NONE;
             for (column, cell) in nearest.iter_mut().enumerate() {
                 if wanted(row * width + column) {
-                    last = Some(column as u32);
+                    last = column as u32;
                 }
                 *cell = last;
             }
-            let mut last = None::<u32>;
+            let mut last = NONE;
             for (column, cell) in nearest.iter_mut().enumerate().rev() {
-                if *cell == Some(column as u32) {
-                    last = *cell;
-                }
                 let column = column as u32;
-                if let Some(right) = last
-                    && cell.is_none_or(|left| right - column < column - left)
-                {
+                if *cell == column {
+                    last = column;
+                }
+                if last != NONE && (*cell == NONE || last - column < column - *cell) {
                     *cell = last;
                 }
             }
         });
-    // ...and of those of its column the nearest.
     let in_row = transposed(&in_row, width);
-    let mut nearest = vec![None; width * height];
+    // ...and of those of its column the nearest.
+    let mut nearest = vec![NONE; width * height];
     nearest
         .par_chunks_mut(height.max(1))
         .zip(in_row.par_chunks(height.max(1)))
         .enumerate()
         .for_each(|(column, (nearest, in_row))| {
-            let squared = |row: usize| in_row[row].map(|c| (f64::from(c) - column as f64).powi(2));
+            let squared =
+                |row: usize| (in_row[row] != NONE).then(|| (f64::from(in_row[row]) - column as f64).powi(2));
             for (cell, root) in nearest.iter_mut().zip(lower_envelope(height, squared)) {
-                *cell = root.and_then(|row| Some([in_row[row]?, row as u32]));
+                *cell = root.map_or(NONE, |row| (row * width) as u32 + in_row[row]);
             }
         });
     transposed(&nearest, height)
@@ -263,11 +263,12 @@ mod tests {
         #[test]
         fn the_nearest_cell_is_the_nearest(wanted in proptest::collection::vec(proptest::bool::weighted(0.05), 13 * 9)) {
             let cells = nearest_cells(13, 9, |i| wanted[i]);
-            let squared = |i: usize, [column, row]: [u32; 2]| (column as i64 - (i % 13) as i64).pow(2) + (row as i64 - (i / 13) as i64).pow(2);
+            let squared = |i: usize, j: usize| (i % 13).abs_diff(j % 13).pow(2) + (i / 13).abs_diff(j / 13).pow(2);
             for (i, cell) in cells.into_iter().enumerate() {
-                let exact = (0..13 * 9).filter(|&j| wanted[j]).map(|j| squared(i, [(j % 13) as u32, (j / 13) as u32])).min();
-                prop_assert_eq!(cell.map(|cell| squared(i, cell)), exact);
-                prop_assert!(cell.is_none_or(|[column, row]| wanted[(row * 13 + column) as usize]));
+                let exact = (0..13 * 9).filter(|&j| wanted[j]).map(|j| squared(i, j)).min();
+                let found = (cell != NONE).then_some(cell as usize);
+                prop_assert_eq!(found.map(|cell| squared(i, cell)), exact);
+                prop_assert!(found.is_none_or(|cell| wanted[cell]));
             }
         }
     }

@@ -119,19 +119,6 @@ pub(crate) fn card(car: &CarView) -> String {
             metrics.particles,
         ));
     }
-    if let Some(load) = &car.load {
-        lines.push(format!(
-            "load    cpu {:.2} cores  update {:.2}/{:.2} ms  scans {:.1}/s  odometry {:.1}/s  dropped {}  memory {} MB{}",
-            load.cpu_process,
-            load.update_us.p50 / 1e3,
-            load.update_us.p99 / 1e3,
-            load.scan_rate,
-            load.odometry_rate,
-            load.drops.total(),
-            load.memory_process / 1_000_000,
-            load.temperature.map_or_else(String::new, |t| format!("  {t:.0} C")),
-        ));
-    }
     if let Some(set) = &car.set {
         let revert = match (&set.reverts_to, set.reverts_in_s) {
             (Some(to), Some(s)) => format!("  falls back to {to} in {s:.0} s"),
@@ -158,6 +145,19 @@ pub(crate) fn card(car: &CarView) -> String {
         number(car.clock_offset_s.map(|s| s * 1e3), 1),
         number(car.clock_uncertainty_s.map(|s| s * 1e3), 1),
     ));
+    if let Some(load) = &car.load {
+        lines.push(format!(
+            "load    cpu {:.2} cores  update {:.2}/{:.2} ms  scans {:.1}/s  odometry {:.1}/s  dropped {}  memory {} MB{}",
+            load.cpu_process,
+            load.update_us.p50 / 1e3,
+            load.update_us.p99 / 1e3,
+            load.scan_rate,
+            load.odometry_rate,
+            load.drops.total(),
+            load.memory_process / 1_000_000,
+            load.temperature.map_or_else(String::new, |t| format!("  {t:.0} C")),
+        ));
+    }
     lines.join("\n")
 }
 

@@ -170,7 +170,7 @@ impl Shown {
         // Where there is little room, all cars and their states stay; events go first.
         let height = frame.area().height;
         let cars = rows.min(height / 2);
-        let log = (height * 3 / 10).min(height.saturating_sub(cars + 9));
+        let log = (height / 4).min(height.saturating_sub(cars + 9));
         let areas = Layout::vertical([
             Constraint::Length(cars),
             Constraint::Fill(1),
@@ -190,6 +190,13 @@ impl Shown {
     }
 
     fn draw_cars(&self, frame: &mut Frame<'_>, area: Rect) {
+        // Where there is little room, why a car is as it is counts for more than numbers that stand below.
+        let wide = area.width >= WIDE;
+        let keep = |column: usize| wide || [0, 1, 2, 4, 6, 8].contains(&column);
+        let columns = |cells: [Line<'static>; 9]| {
+            let kept = cells.into_iter().enumerate().filter(|(column, _)| keep(*column));
+            Row::new(kept.map(|(_, cell)| cell))
+        };
         let head = [
             "car", "state", "set", "pose/s", "age ms", "RTT ms", "missing", "lap s", "why",
         ];
@@ -206,7 +213,7 @@ impl Shown {
             } else {
                 Modifier::empty()
             };
-            Row::new([
+            columns([
                 Line::from(car.car.to_string()).bold(),
                 Line::styled(state, style.bold()),
                 Line::from(set),
@@ -224,8 +231,10 @@ impl Shown {
             .style(Style::new().add_modifier(quiet))
         });
         let widths = [12, 15, 16, 6, 6, 6, 7, 7].map(Constraint::Length).into_iter();
-        let table = Table::new(rows, widths.chain([Constraint::Fill(1)]))
-            .header(Row::new(head).dim())
+        let widths = widths.chain([Constraint::Fill(1)]).enumerate();
+        let widths = widths.filter(|(column, _)| keep(*column)).map(|(_, width)| width);
+        let table = Table::new(rows, widths)
+            .header(columns(head.map(Line::from)).dim())
             .row_highlight_style(Style::new().reversed())
             .block(Block::bordered().title(" pit wall "));
         let mut state = TableState::new().with_selected(self.choice.car);
@@ -244,15 +253,16 @@ impl Shown {
         let Some(car) = self.cars.get(self.choice.car) else {
             return;
         };
-        let chart = if area.height < 11 { 0 } else { 3 };
-        let areas = Layout::vertical([Constraint::Fill(1), Constraint::Length(chart)]).split(area);
         let block = Block::bordered()
             .title(format!(" {} ", car.car))
             .border_style(style_of(&car.state));
-        let mut lines: Vec<Line<'_>> = output::card(car)
+        let card = output::card(car);
+        let room = area.width.saturating_sub(2) as usize;
+        let mut lines: Vec<Line<'_>> = card
             .lines()
             .skip(1)
-            .map(|l| Line::from(l.to_owned()))
+            .flat_map(|line| wrapped(line, room, 8))
+            .map(Line::from)
             .collect();
         let since = if car.blind {
             format!(" silent for {:.1} s", car.quiet_s)
@@ -269,8 +279,16 @@ impl Shown {
             ]),
         );
         if let Some(shadow) = &car.shadow {
-            lines.push(Line::from(crate::commands::params::compare_short(shadow)));
+            let comparison = crate::commands::params::compare_short(shadow);
+            lines.extend(wrapped(&comparison, room, 8).into_iter().map(Line::from));
         }
+        // The curve takes only what the words leave.
+        let chart = if (area.height as usize) < lines.len() + 5 {
+            0
+        } else {
+            3
+        };
+        let areas = Layout::vertical([Constraint::Fill(1), Constraint::Length(chart)]).split(area);
         frame.render_widget(Paragraph::new(lines).block(block), areas[0]);
         let width = areas[1].width.saturating_sub(2) as usize;
         let percent: Vec<u64> = self
@@ -292,18 +310,21 @@ impl Shown {
 
     fn draw_log(&self, frame: &mut Frame<'_>, area: Rect) {
         let room = area.height.saturating_sub(2) as usize;
+        let width = area.width.saturating_sub(2) as usize;
         let lines: Vec<_> = self
             .log
             .iter()
             .rev()
             .take(room)
-            .map(|entry| {
+            .flat_map(|entry| {
                 let style = match entry.severity {
                     Severity::Info => Style::new(),
                     Severity::Warning => Style::new().fg(Color::Yellow),
                     Severity::Critical => Style::new().fg(Color::Red).bold(),
                 };
-                Line::styled(line(entry), style)
+                wrapped(&line(entry), width, 13)
+                    .into_iter()
+                    .map(move |part| Line::styled(part, style))
             })
             .collect();
         let mut title = vec![Span::from(" events, UTC ")];
@@ -321,8 +342,7 @@ impl Shown {
     }
 
     fn draw_foot(&self, frame: &mut Frame<'_>, area: Rect) {
-        let keys =
-            "↑↓ car   s sets   C confirm   R revert   G search the map   a acknowledge   ? keys   q quit";
+        let keys = "↑↓ car  s sets  C confirm  R revert  G search  a acknowledge  ? keys  q quit";
         let foot = match &self.answer {
             None => Line::from(keys).dim(),
             Some((done, text)) => {
@@ -359,16 +379,23 @@ impl Shown {
             })
             .collect();
         lines.push(String::new());
-        lines.push(
-            "Enter put in force   t for a minute unless confirmed   w in the shadow   Esc leave".into(),
+        lines.extend(
+            [
+                "Enter put in force",
+                "t     the same for a minute, unless confirmed",
+                "w     run in the shadow",
+                "Esc   leave",
+            ]
+            .map(str::to_owned),
         );
         popup(frame, &format!("sets of {}", car.car), &lines);
     }
 }
 
-const HELP: [&str; 10] = [
+const HELP: [&str; 11] = [
     "↑ ↓ or k j, 1 ... 9   select a car",
-    "s                     choose a set: put it in force, try it for a minute, run it in the shadow",
+    "s                     choose a set: put it in force, try it for a minute,",
+    "                      run it in the shadow",
     "C                     confirm the set in force: no falling back",
     "R                     revert to the set before",
     "W                     end the shadow",
@@ -378,6 +405,35 @@ const HELP: [&str; 10] = [
     "",
     "any key closes this",
 ];
+
+/// The table has all its columns where it is so wide.
+const WIDE: u16 = 100;
+
+/// A line in pieces of at most `width`, between fields where that is possible, all but the first behind an indent.
+fn wrapped(line: &str, width: usize, indent: usize) -> Vec<String> {
+    let mut lines = Vec::new();
+    let mut rest = line.to_owned();
+    loop {
+        let Some((end, _)) = rest.char_indices().nth(width) else {
+            lines.push(rest);
+            return lines;
+        };
+        // Not within the indent, or it would go on for ever.
+        let from = rest
+            .char_indices()
+            .nth(indent + 1)
+            .map_or(end, |(at, _)| at.min(end));
+        let found = ["  ", " "].iter().find_map(|gap| rest[from..end].rfind(gap));
+        let Some(at) = found.map(|at| from + at) else {
+            lines.push(rest);
+            return lines;
+        };
+        let next = format!("{:indent$}{}", "", rest[at..].trim_start());
+        rest.truncate(at);
+        lines.push(rest);
+        rest = next;
+    }
+}
 
 /// A box in the middle of the screen.
 fn popup(frame: &mut Frame<'_>, title: &str, lines: &[String]) {
@@ -471,6 +527,33 @@ mod tests {
             let text = picture(&shown(), width, height);
             assert!(text.contains("□ BLIND"), "{width}x{height}:\n{text}");
         }
+    }
+
+    #[test]
+    fn lines_break_between_fields() {
+        let line = "load    cpu 0.05 cores  update 0.12/0.24 ms  scans 40.0/s";
+        assert_eq!(
+            wrapped(line, 50, 8),
+            [
+                "load    cpu 0.05 cores  update 0.12/0.24 ms",
+                "        scans 40.0/s"
+            ]
+        );
+        assert_eq!(wrapped(line, 80, 8), [line]);
+        assert_eq!(wrapped("one two", 4, 0), ["one", "two"]);
+        for width in 0..60 {
+            let words: Vec<_> = wrapped(line, width, 8);
+            let words: Vec<_> = words.iter().flat_map(|part| part.split_whitespace()).collect();
+            assert_eq!(words, line.split_whitespace().collect::<Vec<_>>(), "{width}");
+        }
+    }
+
+    #[test]
+    fn a_usual_terminal_tells_why_and_every_key() {
+        let text = picture(&shown(), 80, 24);
+        let row = text.lines().find(|row| row.contains("car-2")).expect("car-2");
+        assert!(row.contains("nothing heard"), "{text}");
+        assert!(text.contains("q quit"), "{text}");
     }
 
     #[test]

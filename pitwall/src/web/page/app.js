@@ -48,7 +48,7 @@ const link = connect(take, ({ up, silent_s: silent, rate }) => {
   const badge = $("link");
   badge.textContent = up ? (snapshot?.replay ? "replay" : "live") : `no news for ${lasting(silent)}: the pit wall's program does not answer`;
   badge.className = `badge ${up ? "up" : "down"}`;
-  badge.title = `${fixed(rate, 0)} snapshots a second`;
+  badge.title = up ? `${fixed(rate, 0)} snapshots a second` : badge.textContent;
   document.body.classList.toggle("cut", !up);
   const late = [...ages].sort((a, b) => a - b);
   pace = `${fixed(rate, 0)} snapshots /s; drawn after ${fixed(late[late.length >> 1], 0)} ms, p99 ${fixed(late[Math.floor(late.length * 0.99)], 0)} ms`;

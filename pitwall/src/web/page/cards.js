@@ -183,7 +183,7 @@ class Card {
       if (this.car) acts.shadow(name, this.car.shadow ? null : otherSet(this.car));
     });
     this.find = this.button("find", "let the car search the whole map (g)", () => acts.search(name));
-    note.append(this.note, this.shadow);
+    note.append(this.note, this.shadow, this.find);
     detail.append(facts, this.spark, this.sets, note);
     this.root.append(head, this.causes, this.brief, detail);
   }
@@ -239,7 +239,7 @@ class Card {
         button.dataset.set = name;
         this.setButtons.set(name, button);
         return button;
-      }), this.find);
+      }));
     }
     const title = set ? `revision ${set.revision}, put in force by ${set.who}` : "";
     for (const [name, button] of this.setButtons) {

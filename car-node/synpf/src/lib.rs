@@ -23,6 +23,7 @@ mod slip;
 mod slip_model;
 mod surprise;
 mod track_map;
+mod walls;
 mod weigh;
 
 pub use beams::{BeamLayout, BeamParameters};

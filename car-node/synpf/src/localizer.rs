@@ -16,11 +16,12 @@ use crate::odometry_track::OdometryTrack;
 use crate::particles::{Belief, Particles};
 use crate::quality::Quality;
 use crate::recovery::Doubt;
-use crate::refine::{Estimate, fit, refine, wall_offset};
+use crate::refine::{Estimate, fit, refine};
 use crate::search::{INDEPENDENT, Search, fit_of};
 use crate::slip::{Slip, SlipWindow};
 use crate::slip_model::SlipModel;
 use crate::surprise::Surprise;
+use crate::walls::Walls;
 use crate::weigh::{Ranges, Weigher};
 use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
 
@@ -197,8 +198,8 @@ pub struct Localizer {
     slip_model: SlipModel,
     /// See [`Update::odometry_jump`].
     odometry_jump: Option<[f64; 2]>,
-    /// How much nearer the walls stand than the map has them, as learned so far [m].
-    wall_offset: f64,
+    /// The walls as the laser sees them, as learned so far.
+    walls: Walls,
     w_ratio: f64,
     /// Updates since the pose was set or found, while the doubt is not yet to be trusted.
     settled: u32,
@@ -251,7 +252,7 @@ impl Localizer {
             slip: Slip::default(),
             slip_model: SlipModel::default(),
             odometry_jump: None,
-            wall_offset: 0.0,
+            walls: Walls::default(),
             w_ratio: 1.0,
             settled: 0,
             per_odometry: PerOdometry::default(),
@@ -479,20 +480,21 @@ impl Localizer {
         self.report(stamp, twist, Some((belief, seconds)), innovation)
     }
 
-    /// Learns how far off the map's walls are on the whole. A map's face is the near edge of the cells that end points fell
-    /// into, so walls stand up to a cell behind it, and the fit would be pushed away from whatever is on one side only.
+    /// Learns how the walls stand, and how end points scatter about them, by the scan at the estimate.
     fn learn_walls(&mut self, motion: Pose) {
-        /// More is not a map's grain [m].
-        const MOST: f64 = 0.05;
         let parameters = &self.parameters.refinement;
         if !parameters.refine || parameters.wall_offset_distance <= 0.0 {
-            self.wall_offset = 0.0;
+            self.walls = Walls::default();
             return;
         }
-        let pose = self.estimate.pose;
-        if let Some(seen) = wall_offset(self.map.field(), &self.scan.points, pose, self.wall_offset) {
-            let gain = 1.0 - (-motion.x.abs() / parameters.wall_offset_distance).exp();
-            self.wall_offset = (self.wall_offset + gain * (seen - self.wall_offset)).clamp(-MOST, MOST);
+        let seen = Walls::seen(
+            self.map.field(),
+            &self.scan.points,
+            self.estimate.pose,
+            self.walls,
+        );
+        if let Some(seen) = seen {
+            self.walls.learn(seen, motion.x, parameters);
         }
     }
 
@@ -562,7 +564,7 @@ impl Localizer {
             &self.scan.points,
             predicted.pose,
             predicted,
-            self.wall_offset,
+            self.walls,
             parameters,
         );
         let own_refined = fit(from_predicted.pose);
@@ -572,7 +574,7 @@ impl Localizer {
                 &self.scan.points,
                 particles.pose,
                 &particles,
-                self.wall_offset,
+                self.walls,
                 parameters,
             );
             if fit(from_particles.pose) > own_refined + FIT_MARGIN {

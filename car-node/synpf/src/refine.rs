@@ -10,6 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::parameters::Check;
+use crate::walls::Walls;
 
 /// Parameters of the refinement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,7 +22,8 @@ pub struct RefinementParameters {
     pub refine_beams: usize,
     /// Most Gauss-Newton steps.
     pub refine_iterations: usize,
-    /// Standard deviation of an end point's distance to its wall [m]: laser, and the grain of a map of 5 cm cells.
+    /// Standard deviation of an end point's distance to its wall [m]: laser, and the grain of a map of 5 cm cells. Where they
+    /// are seen to scatter by more, that counts.
     pub refine_sigma: f64,
     /// Distance from a wall at which an end point counts a quarter [m]; farther ones are opponents. At 0.1 an opponent
     /// that blocks the view for seconds pulls the pose half a metre off; on maps that fit badly that reach does better.
@@ -30,8 +32,8 @@ pub struct RefinementParameters {
     pub refine_correlation: f64,
     /// Share of the particles that are drawn around the refined estimate when resampling.
     pub refine_feedback: f64,
-    /// How fast the offset of the map's walls is learned: the distance driven until 63 % of it are known [m]; 0 takes the
-    /// walls to stand where the map says.
+    /// How fast the offset of the map's walls is learned, and the end points' scatter about them: the distance driven until
+    /// 63 % of it are known [m]; 0 takes the walls to stand where the map says, and end points to scatter by `refine_sigma`.
     pub wall_offset_distance: f64,
 }
 
@@ -83,22 +85,23 @@ pub(crate) fn refine(
     points: &[[f32; 2]],
     start: Pose,
     prior: &Estimate,
-    offset: f64,
+    walls: Walls,
     parameters: &RefinementParameters,
 ) -> Estimate {
     let stride = points.len().div_ceil(parameters.refine_beams).max(1);
-    let weight =
-        1.0 / (parameters.refine_sigma.powi(2) * (parameters.refine_correlation / stride as f64).max(1.0));
+    let sigma = parameters.refine_sigma.max(walls.scatter);
+    let weight = 1.0 / (sigma.powi(2) * (parameters.refine_correlation / stride as f64).max(1.0));
+    let least_reach = parameters.refine_reach * sigma / parameters.refine_sigma;
     let prior_information = regular_inverse(&prior.covariance);
     // A start that may be far off looks farther at first.
     let uncertain = (prior.covariance[(0, 0)] + prior.covariance[(1, 1)])
         .sqrt()
         .min(0.5);
-    let mut reach = parameters.refine_reach.max(uncertain);
+    let mut reach = least_reach.max(uncertain);
     let mut pose = start;
     let mut information = prior_information;
     for _ in 0..parameters.refine_iterations {
-        let normal = accumulate(field, points, stride, pose, offset as f32, reach as f32);
+        let normal = accumulate(field, points, stride, pose, walls.offset as f32, reach as f32);
         information = normal.information * weight + prior_information;
         let off = Vector3::new(
             pose.x - prior.pose.x,
@@ -114,10 +117,10 @@ pub(crate) fn refine(
         let step = step * (0.3 / length.max(0.3)).min(0.1 / step[2].abs().max(0.1));
         pose = Pose::new(pose.x - step[0], pose.y - step[1], pose.heading - step[2]);
         let settled = length < 2e-4 && step[2].abs() < 1e-4;
-        if settled && reach <= parameters.refine_reach {
+        if settled && reach <= least_reach {
             break;
         }
-        reach = (reach * 0.5).max(parameters.refine_reach);
+        reach = (reach * 0.5).max(least_reach);
     }
     Estimate {
         pose,
@@ -183,27 +186,6 @@ fn accumulate(
         information: Matrix3::new(xx, xy, xh, xy, yy, yh, xh, yh, hh),
         gradient: Vector3::new(bx, by, bh),
     }
-}
-
-/// Where the walls stand, seen from where the map has them, by a scan at a pose: the robust mean of the end points' signed
-/// distances [m], positive when the walls stand nearer; None where hardly a point lies at a wall.
-pub(crate) fn wall_offset(field: &DistanceField, points: &[[f32; 2]], pose: Pose, known: f64) -> Option<f64> {
-    const MOST: usize = 180;
-    const REACH: f32 = 0.06;
-    let stride = points.len().div_ceil(MOST).max(1);
-    let cells = 1.0 / field.resolution() as f32;
-    let (sin, cos) = (pose.heading.sin() as f32, pose.heading.cos() as f32);
-    let (mut sum, mut total) = (0.0f32, 0.0f32);
-    for point in points.iter().step_by(stride) {
-        let (dx, dy) = (cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]);
-        if let Some(sample) = field.sample((pose.x as f32 + dx) * cells, (pose.y as f32 + dy) * cells) {
-            let ratio = (sample.distance - known as f32) / REACH;
-            let weight = 1.0 / (1.0 + ratio * ratio).powi(2);
-            sum += weight * sample.distance;
-            total += weight;
-        }
-    }
-    (total > 20.0).then(|| f64::from(sum / total))
 }
 
 /// How well the end points fit at a pose: the mean robust weight, in [0, 1].
@@ -285,7 +267,7 @@ mod tests {
             points,
             start,
             &prior,
-            0.0,
+            Walls::default(),
             &RefinementParameters::default(),
         )
     }

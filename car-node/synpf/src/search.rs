@@ -15,6 +15,7 @@ use crate::parameters::{Check, Parameters};
 use crate::refine::{Estimate, RefinementParameters, fit, refine};
 use crate::seed::seed;
 use crate::surprise::Fall;
+use crate::walls::Walls;
 
 /// Parameters of the search.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -138,7 +139,7 @@ impl Search {
                 &scan.points,
                 prior.pose,
                 &prior,
-                0.0,
+                Walls::default(),
                 &parameters.refinement,
             );
             let score = score(map, scan, candidate.estimate.pose);
@@ -330,7 +331,14 @@ fn fitted(map: &TrackMap, scan: &ReadyScan, pose: Pose, parameters: &Parameters)
         refine_beams: parameters.refinement.refine_beams.min(FITTED_BEAMS),
         ..parameters.refinement.clone()
     };
-    refine(map.field(), &scan.points, pose, &prior, 0.0, &parameters)
+    refine(
+        map.field(),
+        &scan.points,
+        pose,
+        &prior,
+        Walls::default(),
+        &parameters,
+    )
 }
 
 fn same(a: Pose, b: Pose) -> bool {

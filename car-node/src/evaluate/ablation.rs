@@ -55,7 +55,10 @@ const IMPROVEMENTS: [(&str, &[&str]); 15] = [
         ],
     ),
     ("slip learned and taken out of odometry", &["learn_slip"]),
-    ("offset of the map's walls learned, and scatter", &["wall_offset_distance"]),
+    (
+        "offset of the walls and scatter about them learned",
+        &["wall_offset_distance"],
+    ),
     ("injection and search when in doubt", &["injection", "recover"]),
 ];
 

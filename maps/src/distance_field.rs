@@ -39,7 +39,7 @@ pub struct Sample {
 }
 
 impl DistanceField {
-    /// Builds the field: at each cell's centre, the distance to the walls' [`Faces`]. Where walls are thin, the zero moves
+    /// Builds the field: at each cell's centre, the distance to the walls' faces (`faces.rs`). Where walls are thin, the zero moves
     /// to their middle.
     pub fn new(grid: &OccupancyGrid) -> Self {
         let solidity = solidity(grid);

@@ -65,6 +65,8 @@ pub(crate) struct Beam {
 pub(crate) struct ReadyScan {
     /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp [m], in order.
     pub(crate) points: Vec<[f32; 2]>,
+    /// Where the beams begin.
+    pub(crate) base_link_from_laser: Pose,
     /// For each end point the index of its beam.
     pub(crate) beam_of: Vec<u32>,
     /// The beams to weigh.
@@ -117,6 +119,7 @@ impl ReadyScan {
             return Err(Dropped::Malformed);
         }
         self.choose(scan, parameters);
+        self.base_link_from_laser = base_link_from_laser;
         let nearest = (scan.range_min as f32).max(0.01);
         let farthest = scan.range_max.min(max_range) as f32;
 

@@ -117,7 +117,8 @@ pub struct Update {
     pub spread: [f64; 2],
     /// Mass of the second cluster of particles over that of the first, in [0, 1] (clusters of 0.5 m and 20 deg).
     pub second_mode: f64,
-    /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall, in [0, 1].
+    /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall, in [0, 1]. A beam is valid that
+    /// has a return, and does not leave the mapped part of the world, as through a door that was shut when it was mapped.
     pub alignment: f64,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
     pub residual: f64,
@@ -598,12 +599,7 @@ impl Localizer {
         innovation: Pose,
     ) -> Update {
         self.number += 1;
-        let quality = Quality::new(
-            &self.map,
-            &self.scan,
-            self.estimate.pose,
-            self.base_link_from_laser,
-        );
+        let quality = Quality::new(&self.map, &self.scan, self.estimate.pose);
         let (mut spread, mut ess_ratio, mut second_mode) = ([0.0; 2], 1.0, 0.0);
         if let Some((belief, seconds)) = belief {
             spread = along_and_across(&belief.covariance, belief.mean.heading);

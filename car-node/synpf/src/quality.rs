@@ -38,17 +38,18 @@ impl Quality {
         (self.alignment / (1.0 - blocked)).min(1.0)
     }
 
-    /// Judges a scan at a pose in the grid's frame.
-    pub(crate) fn new(map: &TrackMap, scan: &ReadyScan, pose: Pose, base_link_from_laser: Pose) -> Self {
+    /// Judges a scan at a pose in the grid's frame. Beams that end where nothing was mapped ([`TrackMap::unmapped`]) are not
+    /// valid: they say nothing on the pose. At most half of a scan is excused so.
+    pub(crate) fn new(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> Self {
         let field = map.field();
         let cells = 1.0 / field.resolution() as f32;
         let stride = scan.points.len().div_ceil(BEAMS).max(1);
         let (sin, cos) = pose.heading.sin_cos();
         let (sin, cos) = (sin as f32, cos as f32);
         let (x, y) = (pose.x as f32, pose.y as f32);
-        let laser = pose * base_link_from_laser;
+        let laser = pose * scan.base_link_from_laser;
         let (lx, ly) = (laser.x as f32, laser.y as f32);
-        let (mut count, mut aligned, mut residual) = (0.0f32, 0.0f32, 0.0f32);
+        let (mut count, mut aligned, mut residual, mut unmapped) = (0.0f32, 0.0f32, 0.0f32, 0.0f32);
         let (mut cast, mut short, mut long) = (0.0f32, 0.0f32, 0.0f32);
         for (k, point) in scan.points.iter().step_by(stride).enumerate() {
             let (px, py) = (
@@ -59,10 +60,13 @@ impl Quality {
                 .from_wall(px * cells, py * cells)
                 .map_or(1.0, |d| d.min(1.0));
             count += 1.0;
-            residual += distance;
             if distance < ALIGNED {
                 aligned += 1.0;
+            } else if map.unmapped([lx, ly], [px, py]) {
+                unmapped += 1.0;
+                continue;
             }
+            residual += distance;
             if k % (BEAMS / CAST) == 0 {
                 let (dx, dy) = (px - lx, py - ly);
                 let range = dx.hypot(dy).max(1e-3);
@@ -74,11 +78,79 @@ impl Quality {
             }
         }
         let share = |part: f32, of: f32| f64::from(part / of.max(1.0));
+        let valid = count - unmapped.min(0.5 * count);
         Self {
-            alignment: share(aligned, count),
-            residual: share(residual, count),
+            alignment: share(aligned, valid),
+            residual: share(residual, valid),
             short: share(short, cast),
             long: share(long, cast),
         }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::search::fit_of;
+    use maps::{Cell, OccupancyGrid};
+
+    /// A room of 10 x 6 m in cells of 5 cm, with a door 2 m wide in its right wall. Nothing was mapped around it.
+    pub(crate) fn room() -> TrackMap {
+        let (width, height) = (240, 160);
+        let cell = |column: usize, row: usize| {
+            let inside = (20..220).contains(&column) && (20..140).contains(&row);
+            let door = column >= 200 && (60..100).contains(&row);
+            match (inside, column, row) {
+                (false, ..) => Cell::Unknown,
+                (true, 20..=22 | 217..=219, _) | (true, _, 20..=22 | 137..=139) if !door => Cell::Occupied,
+                _ => Cell::Free,
+            }
+        };
+        let cells = (0..width * height).map(|i| cell(i % width, i / width)).collect();
+        TrackMap::new(OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells)).expect("free space")
+    }
+
+    /// What a laser sees all around; there is a wall 2.5 m behind the door.
+    pub(crate) fn scan(map: &TrackMap, pose: Pose) -> ReadyScan {
+        let points = (0..720).map(|i| {
+            let angle = f64::from(i) * 0.5f64.to_radians();
+            let direction = Pose::new(pose.x, pose.y, pose.heading + angle);
+            let range = map.range(direction, 30.0);
+            let (sin, cos) = direction.heading.sin_cos();
+            let through_door = pose.x + range * cos > 10.95 && (pose.y + range * sin - 4.0).abs() < 1.1;
+            let range = if through_door {
+                (13.5 - pose.x) / cos
+            } else {
+                range
+            };
+            [(range * angle.cos()) as f32, (range * angle.sin()) as f32]
+        });
+        let mut scan = ReadyScan::default();
+        scan.points.extend(points);
+        scan
+    }
+
+    #[test]
+    fn beams_through_a_door_that_nobody_mapped_do_not_count() {
+        let map = room();
+        let pose = Pose::new(9.0, 4.0, 0.3);
+        let scan = scan(&map, pose);
+        let right = Quality::new(&map, &scan, pose);
+        assert!(right.alignment > 0.98, "{right:?}");
+        assert!(right.residual < 0.05, "{right:?}");
+        assert_eq!((right.short, right.long), (0.0, 0.0));
+        assert!(fit_of(&map, &scan, pose) > 0.85);
+    }
+
+    #[test]
+    fn beams_through_walls_count() {
+        let map = room();
+        let pose = Pose::new(9.0, 4.0, 0.3);
+        let scan = scan(&map, pose);
+        // As far to the left as the room is wide: the same walls in view, but for the door.
+        let mirrored = Pose::new(3.0, 4.0, 0.3 + std::f64::consts::PI);
+        let wrong = Quality::new(&map, &scan, mirrored);
+        assert!(wrong.alignment < 0.85 && wrong.long > 0.1, "{wrong:?}");
+        assert!(fit_of(&map, &scan, mirrored) < fit_of(&map, &scan, pose) - 0.08);
     }
 }

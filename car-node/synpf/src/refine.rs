@@ -190,6 +190,18 @@ fn accumulate(
 
 /// How well the end points fit at a pose: the mean robust weight, in [0, 1].
 pub(crate) fn fit(field: &DistanceField, points: &[[f32; 2]], most: usize, pose: Pose, reach: f32) -> f64 {
+    fit_by(field, points, most, pose, reach, |weight, _| weight)
+}
+
+/// The same with a say in the weights, which are given with where the beams end, in the grid's frame [m].
+pub(crate) fn fit_by(
+    field: &DistanceField,
+    points: &[[f32; 2]],
+    most: usize,
+    pose: Pose,
+    reach: f32,
+    judged: impl Fn(f32, [f32; 2]) -> f32,
+) -> f64 {
     let stride = points.len().div_ceil(most).max(1);
     let cells = 1.0 / field.resolution() as f32;
     let (sin, cos) = pose.heading.sin_cos();
@@ -198,11 +210,15 @@ pub(crate) fn fit(field: &DistanceField, points: &[[f32; 2]], most: usize, pose:
     let (mut sum, mut count) = (0.0f32, 0);
     for point in points.iter().step_by(stride) {
         let (dx, dy) = (cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]);
+        let end = [x + dx, y + dy];
         count += 1;
-        if let Some(distance) = field.nearest((x + dx) * cells, (y + dy) * cells) {
-            let ratio = distance / reach;
-            sum += 1.0 / (1.0 + ratio * ratio);
-        }
+        let weight = field
+            .nearest(end[0] * cells, end[1] * cells)
+            .map_or(0.0, |distance| {
+                let ratio = distance / reach;
+                1.0 / (1.0 + ratio * ratio)
+            });
+        sum += judged(weight, end);
     }
     f64::from(sum) / f64::from(count.max(1))
 }

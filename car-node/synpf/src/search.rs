@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::TrackMap;
 use crate::beams::ReadyScan;
 use crate::parameters::{Check, Parameters};
-use crate::refine::{Estimate, RefinementParameters, fit, refine};
+use crate::refine::{Estimate, RefinementParameters, fit_by, refine};
 use crate::seed::seed;
 use crate::surprise::Fall;
 use crate::walls::Walls;
@@ -272,6 +272,10 @@ impl Search {
         if explains(own) && !sudden && !as_usual {
             return None;
         }
+        // On a map that is out of date something fits by chance, hardly ever well.
+        if best.score < INDEPENDENT * CONVINCING.ln() {
+            return None;
+        }
         let elsewhere = !same(best.estimate.pose, pose);
         let most = parameters.search.search_margin;
         // Along a straight a wrong place fits nearly as well as the right one; that the pose jumped is evidence as well.
@@ -289,6 +293,12 @@ impl Search {
         Some(search)
     }
 }
+
+/// Fit of a place for which another one is given up.
+const CONVINCING: f64 = 0.7;
+
+/// Weight of a beam that says nothing.
+const NEUTRAL: f32 = 0.5;
 
 /// A pose may be wrong by this much along its heading without being another place [0.1 m].
 const NEARBY: i32 = 6;
@@ -308,9 +318,18 @@ fn explains(score: f64) -> bool {
     score > INDEPENDENT * 0.35f64.ln()
 }
 
-/// How well a scan's end points lie on walls at a pose, in [0, 1]: what scores are made of.
+/// How well a scan's end points lie on walls at a pose, in [0, 1]: what scores are made of. A beam that ends where nothing
+/// was mapped speaks neither for the pose nor against it.
 pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
-    fit(map.field(), &scan.points, BEAMS, pose, 0.08)
+    let laser = pose * scan.base_link_from_laser;
+    let laser = [laser.x as f32, laser.y as f32];
+    fit_by(map.field(), &scan.points, BEAMS, pose, 0.08, |weight, end| {
+        if weight < NEUTRAL && map.unmapped(laser, end) {
+            NEUTRAL
+        } else {
+            weight
+        }
+    })
 }
 
 /// Candidates from one scan alone.
@@ -359,4 +378,32 @@ fn score(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
         return INDEPENDENT * 0.02f64.ln();
     }
     INDEPENDENT * fit_of(map, scan, pose).max(0.02).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quality::tests::{room, scan};
+
+    #[test]
+    fn another_place_is_convincing_or_none_is_better() {
+        let map = room();
+        let (truth, wrong) = (Pose::new(9.0, 4.0, 0.3), Pose::new(3.0, 5.5, 1.4));
+        // With so many of ten beams on something that is not on the map.
+        let opinion = |strange: usize| {
+            let mut scan = scan(&map, truth);
+            for (_, point) in scan
+                .points
+                .iter_mut()
+                .enumerate()
+                .filter(|(i, _)| i / 9 % 10 < strange)
+            {
+                *point = point.map(|v| 0.6 * v);
+            }
+            Search::second_opinion(&map, &scan, wrong, true, None, &Parameters::default())
+        };
+        let search = opinion(0).expect("a better place");
+        assert!(same(search.candidates[0].estimate.pose, truth), "{search:?}");
+        assert_eq!(opinion(5).map(|search| search.candidates.len()), None);
+    }
 }

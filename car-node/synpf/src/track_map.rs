@@ -154,6 +154,24 @@ impl TrackMap {
         self.blurred.get_or_init(|| Blurred::new(&self.grid, &self.field))
     }
 
+    /// Whether a beam from a laser ends where nothing was mapped, without having met a wall on its way: through an open door,
+    /// or past where mapping stopped. Such a beam says nothing on where the laser is. Points in the grid's frame [m].
+    pub(crate) fn unmapped(&self, laser: [f32; 2], end: [f32; 2]) -> bool {
+        let cells = 1.0 / self.grid.resolution as f32;
+        let cell = end.map(|v| (v * cells).floor() as i64);
+        if self.grid.cell(cell[0], cell[1]) != Cell::Unknown {
+            return false;
+        }
+        let (dx, dy) = (end[0] - laser[0], end[1] - laser[1]);
+        let range = dx.hypot(dy).max(1e-3);
+        let direction = [dx / range, dy / range];
+        let start = laser.map(|v| v * cells);
+        let path = self.field.trace(start, direction, range * cells);
+        let met = [start[0] + path * direction[0], start[1] + path * direction[1]];
+        // Past the map's rim there are no walls.
+        path >= range * cells || (path > 0.0 && self.field.sample(met[0], met[1]).is_none())
+    }
+
     pub(crate) fn grid_from_map(&self) -> Pose {
         self.grid_from_map
     }

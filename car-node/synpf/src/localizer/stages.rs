@@ -80,12 +80,7 @@ impl Localizer {
                 std::hint::black_box(self.refined(&self.estimate, &belief));
             }
             Stage::Judge => {
-                std::hint::black_box(Quality::new(
-                    &self.map,
-                    &self.scan,
-                    self.estimate.pose,
-                    self.base_link_from_laser,
-                ));
+                std::hint::black_box(Quality::new(&self.map, &self.scan, self.estimate.pose));
             }
             Stage::Look => {
                 std::hint::black_box(seed(&self.map, &self.scan.points, &self.parameters.search));

@@ -220,6 +220,27 @@ impl SensorLog {
         let first = scans.next()?;
         Some([first, scans.next_back().unwrap_or(first)])
     }
+
+    /// Keeps the part that begins `from` after the first scan and lasts so long [s], with the odometry that leads up to its
+    /// first scan. A log without a scan stays as it is.
+    pub fn keep(&mut self, from: f64, lasting: f64) {
+        /// Odometry is that much older at most, or there is a gap.
+        const LEAD: f64 = 0.2;
+        let Some([first, _]) = self.span() else {
+            return;
+        };
+        let begin = first.plus(from);
+        let within = |stamp: Stamp, lead: f64| (-lead..lasting).contains(&stamp.since(begin));
+        self.arrivals.retain(|arrival| {
+            let lead = if matches!(arrival.event, SensorEvent::Scan(_)) {
+                0.0
+            } else {
+                LEAD
+            };
+            within(arrival.event.stamp(), lead)
+        });
+        self.truth.retain(|(stamp, _)| within(*stamp, LEAD));
+    }
 }
 
 impl Bag {

@@ -165,6 +165,12 @@ pub(crate) struct Bags {
     /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad.
     #[arg(long, value_name = "FILE.csv", conflicts_with = "truth_topic")]
     pub(crate) truth: Option<PathBuf>,
+    /// Begin so long after the first scan [s].
+    #[arg(long, value_name = "S", default_value = "0", allow_negative_numbers = true, value_parser = log_seconds)]
+    pub(crate) from: f64,
+    /// Take so much of the bag [s] [default: all that follows].
+    #[arg(long = "for", value_name = "S", allow_negative_numbers = true, value_parser = log_seconds)]
+    pub(crate) lasting: Option<f64>,
     /// Which topics of the bags to take.
     #[command(flatten)]
     pub(crate) topics: TopicArguments,
@@ -366,6 +372,10 @@ fn seed(text: &str) -> Result<u64, String> {
 
 fn speed(text: &str) -> Result<f64, String> {
     within(text, 0.1, 2.0)
+}
+
+fn log_seconds(text: &str) -> Result<f64, String> {
+    within(text, 0.0, 1e6)
 }
 
 fn rate(text: &str) -> Result<f64, String> {

@@ -245,6 +245,22 @@ fn a_drive_is_localized_measured_and_repeatable() {
 }
 
 #[test]
+fn a_part_of_a_bag_is_taken() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    let part = ["--initial-pose", "truth", "--from", "1.5", "--for", "2", "--json"];
+    let output = evaluate(&map, &bag, &part);
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    assert_eq!(report["scans"], 80, "40 a second");
+    assert_eq!(report["updates"], 80, "odometry leads up to the first: {report}");
+    let last = &report["state_changes"][0];
+    assert_eq!(
+        last["right"], true,
+        "it starts from the truth at that time: {report}"
+    );
+}
+
+#[test]
 fn what_is_wrong_is_named() {
     let folder = tempfile::tempdir().expect("folder");
     let here = folder.path();
@@ -289,6 +305,8 @@ fn what_is_wrong_is_named() {
     for fault in ["no-scans@4+1", "kidnap@3+1"] {
         fails(2, &map, &bag, &["--fault", fault], &[fault, "ends 4.0 s"]);
     }
+    fails(2, &map, &bag, &["--from", "9"], &["drive.mcap: no scan", "--from"]);
+    fails(2, &map, &bag, &["--for", "-1"], &["--for", "from 0"]);
     fails(2, &map, &bag, &["--fault", "flood@1+1"], &["--fault", "splice"]);
     fails(
         2,

@@ -60,6 +60,17 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
             let mount = log.mount.unwrap_or_else(Mount::typical);
             log.truth = read_poses(truth, mount.base_link_from_laser)?;
         }
+        if bags.from > 0.0 || bags.lasting.is_some() {
+            log.keep(bags.from, bags.lasting.unwrap_or(f64::INFINITY));
+            if log.span().is_none() {
+                let text = format!(
+                    "{}: no scan from {} s on, as --from says",
+                    bag.display(),
+                    bags.from
+                );
+                bail!(BadUsage(text));
+            }
+        }
         Ok((bag, log))
     };
     files.map(with_truth).collect()

@@ -305,7 +305,13 @@ fn what_is_wrong_is_named() {
     for fault in ["no-scans@4+1", "kidnap@3+1"] {
         fails(2, &map, &bag, &["--fault", fault], &[fault, "ends 4.0 s"]);
     }
-    fails(2, &map, &bag, &["--from", "9"], &["drive.mcap: no scan", "--from"]);
+    fails(
+        2,
+        &map,
+        &bag,
+        &["--from", "9"],
+        &["drive.mcap: no scan", "--from"],
+    );
     fails(2, &map, &bag, &["--for", "-1"], &["--for", "from 0"]);
     fails(2, &map, &bag, &["--fault", "flood@1+1"], &["--fault", "splice"]);
     fails(

@@ -32,6 +32,11 @@ pub(crate) struct Slip {
     pub(crate) unexplained: f64,
     /// Odometry's yaw rate less the posterior's [rad/s].
     pub(crate) yaw_rate: f64,
+    /// The share of odometry's turn by which it errs: a yaw rate told from the steering is off by more the faster the car
+    /// turns, and changes its sign with the bend.
+    turn_share: f64,
+    /// What of `yaw_rate` that does not explain [rad/s].
+    turn_rest: f64,
 }
 
 impl Slip {
@@ -39,17 +44,21 @@ impl Slip {
     /// it was.
     pub(crate) fn corrected(self, motion: Pose, seconds: f64) -> Pose {
         // More than this is a pose that has jumped.
-        let (ratio, yaw_rate) = (self.unexplained.clamp(-0.3, 0.3), self.yaw_rate.clamp(-2.0, 2.0));
+        let ratio = self.unexplained.clamp(-0.3, 0.3);
+        let (share, rest) = (self.turn_share.clamp(-1.0, 1.0), self.turn_rest.clamp(-2.0, 2.0));
         Pose::new(
             motion.x * (1.0 - ratio),
             motion.y * (1.0 - ratio),
-            motion.heading - yaw_rate * seconds,
+            motion.heading * (1.0 - share) - rest * seconds,
         )
     }
 }
 
 /// Length of the window [s].
 const WINDOW: f64 = 0.3;
+
+/// A yaw rate of which its error is hardly a share [rad/s].
+const HARDLY: f64 = 0.5;
 
 /// Below this a share of the distance says nothing [m/s].
 const WALKING: f64 = 1.0;
@@ -90,11 +99,17 @@ impl SlipWindow {
                 ((odometry - posterior) / driven).clamp(-2.0, 2.0)
             }
         };
-        let yaw_rate = (sum(|step| step.odometry[1]) - sum(|step| step.posterior[1])) / seconds;
+        let turn = sum(|step| step.odometry[1]);
+        let yaw_rate = (turn - sum(|step| step.posterior[1])) / seconds;
+        // Least squares, shrunk by what a car that hardly turns could tell.
+        let turn_share = sum(|step| step.odometry[1] * (step.odometry[1] - step.posterior[1]))
+            / sum(|step| step.odometry[1].powi(2) + (HARDLY * step.seconds).powi(2)).max(1e-12);
         Slip {
             ratio: share(driven),
             unexplained: share(sum(|step| step.odometry[0])),
             yaw_rate,
+            turn_share,
+            turn_rest: yaw_rate - turn_share * turn / seconds,
         }
     }
 
@@ -133,6 +148,28 @@ mod tests {
         assert!((slip.ratio - 0.01 / 0.11).abs() < 1e-9);
         assert!((slip.unexplained - 0.005 / 0.11).abs() < 1e-9);
         assert!((slip.yaw_rate - 0.4).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_share_of_the_turn_changes_its_sign_with_the_bend() {
+        // Odometry turns a quarter too far, as a yaw rate told from the steering does.
+        let mut window = SlipWindow::default();
+        for (i, turn) in (0..20i64).zip([0.05, 0.04, 0.03, 0.04].iter().cycle()) {
+            let posterior = Pose::new(0.1, 0.0, 0.8 * turn);
+            window.push(
+                Stamp(i * 25_000_000),
+                0.025,
+                0.1,
+                Pose::new(0.1, 0.0, *turn),
+                posterior,
+            );
+        }
+        let slip = window.slip();
+        let off =
+            |turn: f64, seconds: f64| slip.corrected(Pose::new(0.1, 0.0, turn), seconds).heading - 0.8 * turn;
+        assert!(off(0.04, 0.025).abs() < 5e-4, "{slip:?}");
+        // Into the bend the other way; by the yaw rate alone it would be off by 0.016.
+        assert!(off(-0.04, 0.025).abs() < 5e-3, "{slip:?}");
     }
 
     #[test]

@@ -163,6 +163,9 @@ const CARRY: f64 = 0.25;
 /// A pause between scans after which the motion is uncertain beyond its tuning [s].
 const GAP: f64 = 0.5;
 
+/// By how much the noise is wider after such a pause.
+const AFTER_GAP: f64 = 2.0;
+
 /// How far the speed of wheels that spin or lock may be off, as a share of it.
 const SPINNING_SPEED_ERROR: f64 = 0.6;
 
@@ -499,14 +502,15 @@ impl Localizer {
         }
     }
 
-    /// By how much the noise is wider than tuned: after a pause, and with slip where the set adapts.
+    /// By how much the noise is wider than tuned: after a pause, or with slip where the set adapts. The larger of the two: the
+    /// noise grows with the way as it is, and a prediction that allows everything is as easily pulled to a wrong place.
     fn widen(&self, seconds: f64) -> f64 {
-        let pause = if seconds > GAP { 3.0 } else { 1.0 };
+        let pause = if seconds > GAP { AFTER_GAP } else { 1.0 };
         if !self.parameters.motion.adaptive {
             return pause;
         }
         let slip = self.slip.unexplained.abs() / 0.05 + self.slip.yaw_rate.abs() / 0.5;
-        pause * (1.0 + slip).min(4.0)
+        (1.0 + slip).min(4.0).max(pause)
     }
 
     /// Uncertainty of a motion in the frame of its start, for the refined estimate.

@@ -28,7 +28,7 @@ pub struct Verdict {
 /// Ages of poses are summarised over this long [s].
 const AGE_WINDOW: f64 = 1.0;
 
-/// A jump of the odometry is told for so long [s].
+/// A jump of the odometry or of the pose is told for so long [s].
 const JUMP_TOLD: f64 = 3.0;
 
 /// Follows one localizer.
@@ -58,6 +58,8 @@ pub struct Monitor {
     ages: VecDeque<(Stamp, f64)>,
     /// When odometry jumped last, and by how far [m].
     jumped: Option<(Stamp, f64)>,
+    /// When a trusted pose leapt last, and how far [m].
+    leapt: Option<(Stamp, f64)>,
     /// Where STALE goes back to.
     before_stale: State,
 }
@@ -87,6 +89,7 @@ impl Monitor {
             refused: 0,
             ages: VecDeque::new(),
             jumped: None,
+            leapt: None,
             before_stale: State::Init,
         }
     }
@@ -131,6 +134,10 @@ impl Monitor {
         if let Some([distance, _]) = update.odometry_jump {
             self.jumped = Some((now, distance));
         }
+        let leap = self.leap(update);
+        if let Some(distance) = leap {
+            self.leapt = Some((now, distance));
+        }
         // Out of STALE first: what this scan says to the pose is said with it.
         let missing = self.missing(now);
         self.stale_or_not(!missing.is_empty(), now);
@@ -156,7 +163,7 @@ impl Monitor {
         self.last_update = Some(update.stamp);
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
-        self.advance(update.mode, update.stamp, now);
+        self.advance(update.mode, leap.is_some(), update.stamp, now);
         self.verdict.causes = self.causes(missing, now);
         &self.verdict
     }
@@ -258,7 +265,18 @@ impl Monitor {
         }
     }
 
-    fn advance(&mut self, mode: Mode, stamp: Stamp, now: Stamp) {
+    /// How far a pose that was trusted has leapt with one scan [m]. After a silence it may.
+    fn leap(&self, update: &Update) -> Option<f64> {
+        let trusted = matches!(self.verdict.state, State::Localized | State::Degraded);
+        let next = self
+            .last_update
+            .is_some_and(|last| update.stamp.since(last) <= self.thresholds.stale_after);
+        let [distance, _] = update.innovation;
+        (trusted && next && update.mode == Mode::Tracking && distance > self.thresholds.leap)
+            .then_some(distance)
+    }
+
+    fn advance(&mut self, mode: Mode, leapt: bool, stamp: Stamp, now: Stamp) {
         let t = self.thresholds;
         let good = self
             .good_since
@@ -269,7 +287,8 @@ impl Monitor {
             .iter()
             .filter(|since| lasts(**since, t.lost_after))
             .count();
-        let lost = families >= 2
+        let lost = leapt
+            || families >= 2
             || lasts(self.wrong_since, t.wrong_after)
             || lasts(self.lost_since[Family::EndPoints as usize], t.alone_after);
         let degraded = self.findings.iter().any(|finding| self.lasting(finding));
@@ -349,10 +368,20 @@ impl Monitor {
                 ..plain(CauseKind::OdometryJump, Severity::Warning)
             });
         }
+        let leapt = self.leapt.filter(|(at, _)| now.since(*at) < JUMP_TOLD);
+        if let Some((_, distance)) = leapt {
+            causes.push(measured(
+                CauseKind::Innovation,
+                Severity::Critical,
+                distance,
+                self.thresholds.leap,
+            ));
+        }
         causes.extend(
             self.findings
                 .iter()
                 .filter(|finding| !finding.degrades || self.lasting(finding))
+                .filter(|finding| leapt.is_none() || finding.kind != CauseKind::Innovation)
                 .map(|f| measured(f.kind, f.severity, f.value, f.limit)),
         );
         causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
@@ -617,6 +646,33 @@ mod tests {
             [State::Degraded, State::Localized],
             "half a second of good scans mends it"
         );
+    }
+
+    #[test]
+    fn a_pose_that_finds_itself_metres_away_was_lost() {
+        let leap = |update: &mut Update| update.innovation = [2.7, 0.0];
+        let mut drive = Drive::localized();
+        assert_eq!(drive.drive(SCAN, leap), [State::Localized, State::Lost]);
+        let told = drive.monitor.verdict().causes.iter().map(ToString::to_string);
+        assert!(
+            told.eq(["pose corrected by a jump 2.70 m (limit 1.00 m)"]),
+            "{:?}",
+            drive.monitor.verdict().causes
+        );
+        assert_eq!(
+            drive.drive(4.0, |_| ()),
+            [State::Lost, State::Converging, State::Localized]
+        );
+        assert_eq!(drive.monitor.verdict().causes, []);
+
+        // A pose that was not trusted yet may, and so may one of which nothing was seen for a while.
+        let mut drive = Drive::new();
+        drive.drive(0.2, |_| ());
+        assert_eq!(drive.drive(SCAN, leap), [State::Converging]);
+        let mut drive = Drive::localized();
+        drive.now = drive.now.plus(1.5);
+        drive.monitor.tick(drive.now);
+        assert_eq!(drive.drive(SCAN, leap), [State::Stale, State::Degraded]);
     }
 
     #[test]

@@ -253,9 +253,9 @@ fn a_part_of_a_bag_is_taken() {
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
     assert_eq!(report["scans"], 80, "40 a second");
     assert_eq!(report["updates"], 80, "odometry leads up to the first: {report}");
-    let last = &report["state_changes"][0];
+    let first = &report["state_changes"][0];
     assert_eq!(
-        last["right"], true,
+        first["right"], true,
         "it starts from the truth at that time: {report}"
     );
 }

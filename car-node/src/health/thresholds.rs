@@ -55,10 +55,10 @@ pub struct Thresholds {
     pub yaw_rate_residual: f64,
     /// A correction above this is degraded [m].
     pub innovation: f64,
-    /// A correction above this by one scan is another place: the pose was wrong until then [m].
-    pub leap: f64,
     /// A correction above this is degraded [rad].
     pub innovation_angle: f64,
+    /// A correction above this by one scan is another place: the pose was wrong until then [m].
+    pub leap: f64,
     /// Median age of poses above this is degraded [s]. Above the 40 ms of a busy car: a scan alone arrives 17 to
     /// 22 ms after its stamp.
     pub age: f64,
@@ -105,8 +105,8 @@ impl Default for Thresholds {
             slip_severe: 0.20,
             yaw_rate_residual: 0.3,
             innovation: 0.3,
-            leap: 1.0,
             innovation_angle: 10_f64.to_radians(),
+            leap: 1.0,
             age: 0.080,
             stale_after: 0.4,
             smoothing: 0.25,

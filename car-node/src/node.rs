@@ -17,7 +17,7 @@ use protocol::{
     CarInfo, CarName, ClockReply, ClockRequest, EventKind, Key, LinkReport, Rates, Stamps, Topic, decode,
     encode,
 };
-use synpf::{Localizer, SetUpError, TrackMap};
+use synpf::{PoseError, SetUpError, SynPf, TrackMap};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
 use zenoh::query::{Query, Queryable};
@@ -120,6 +120,9 @@ pub enum NodeError {
     /// The localizer refuses its set-up.
     #[error(transparent)]
     SetUp(#[from] SetUpError),
+    /// The pose to start from cannot be.
+    #[error(transparent)]
+    Pose(#[from] PoseError),
     /// The set that was in force is gone.
     #[error(transparent)]
     Set(#[from] SetError),
@@ -198,7 +201,7 @@ impl Node {
         let memory = file.as_ref().map_or(Ok(Memory::default()), StateFile::read)?;
         let set = first_set(set, &memory)?;
         let mount = source.mount();
-        let mut localizer = Localizer::new(
+        let mut localizer = SynPf::new(
             Arc::clone(&map.map),
             mount.base_link_from_laser,
             set.parameters.clone(),
@@ -423,7 +426,7 @@ fn first_set(wanted: Option<NamedSet>, memory: &Memory) -> Result<NamedSet, SetE
 }
 
 /// Gives the localizer its start. True when that is a pose.
-fn begin_at(localizer: &mut Localizer, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
+fn begin_at(localizer: &mut SynPf, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
     match begin {
         Begin::Pose(pose) => localizer.initialize(pose)?,
         Begin::Source => localizer.initialize(start.ok_or(NodeError::NoStart)?)?,

@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, bounded, select};
 use protocol::{EventKind, SetRef};
-use synpf::{Localizer, Mode, Odometry, Scan, Stamp, Update, YawRate};
+use synpf::{Mode, Odometry, Scan, Stamp, SynPf, Update, YawRate};
 
 use self::budget::{Budget, Spent};
 use self::comparison::{Judged, Window};
@@ -65,7 +65,7 @@ pub enum Wish {
         /// Who wants it.
         who: String,
         /// A localizer under it, without a pose.
-        localizer: Box<Localizer>,
+        localizer: Box<SynPf>,
     },
     /// Run none.
     End {
@@ -152,7 +152,7 @@ pub fn start(
 /// A set in the shadow.
 struct Running {
     name: String,
-    localizer: Box<Localizer>,
+    localizer: Box<SynPf>,
     /// Since when it has had a pose.
     placed: Option<Stamp>,
     window: Window,

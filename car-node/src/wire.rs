@@ -241,7 +241,7 @@ pub fn candidate(index: usize, hypothesis: &Hypothesis) -> Candidate {
     Candidate {
         number: u32::try_from(index + 1).unwrap_or(u32::MAX),
         pose: pose2(hypothesis.pose),
-        score: share(hypothesis.fit()),
+        score: share(hypothesis.fit),
     }
 }
 

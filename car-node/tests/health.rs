@@ -12,7 +12,7 @@ use car_node::health::State;
 use car_node::source::{Belief, Feed, Next, Race, Source};
 use maps::{Cell, OccupancyGrid, Pose};
 use simulator::{CarSetup, Guidance, Surface, Track, Wall, Walls};
-use synpf::{Localizer, Parameters, TrackMap};
+use synpf::{Parameters, SynPf, TrackMap};
 
 fn club() -> Track {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
@@ -76,9 +76,9 @@ fn sound() -> SensorLog {
     LOG.get_or_init(|| race(club(), &[], 20.0, 20.0)).clone()
 }
 
-fn localizer(map: &Arc<TrackMap>, mount: Mount) -> Localizer {
+fn localizer(map: &Arc<TrackMap>, mount: Mount) -> SynPf {
     let hq = Parameters::named("hq").expect("ships");
-    Localizer::new(Arc::clone(map), mount.base_link_from_laser, hq, 7).expect("sound")
+    SynPf::new(Arc::clone(map), mount.base_link_from_laser, hq, 7).expect("sound")
 }
 
 /// What the state says over a log, from the true start moved by `off`.

@@ -10,7 +10,7 @@ use car_node::evaluate::{Outcome, Start, Summaries, Truth, mean, run as run_over
 use car_node::frames::Mount;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use synpf::{Localizer, SetUpError, TrackMap};
+use synpf::{SetUpError, SynPf, TrackMap};
 
 use crate::cli::Ablate;
 
@@ -118,7 +118,7 @@ fn over(
     seed: u64,
 ) -> anyhow::Result<Outcome> {
     let parameters = step.parameters.clone();
-    let mut localizer = Localizer::new(Arc::clone(map), mount.base_link_from_laser, parameters, seed)?;
+    let mut localizer = SynPf::new(Arc::clone(map), mount.base_link_from_laser, parameters, seed)?;
     Ok(run_over(&mut localizer, &log.arrivals, truth, start, |_, _| {})?)
 }
 

@@ -11,7 +11,7 @@ use car_node::bag::SensorLog;
 use car_node::evaluate::{ErrorSummary, Fault, FaultReport, Outcome, Start, Truth, run as run_over};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use synpf::{Localizer, Update};
+use synpf::{SynPf, Update};
 
 use super::BadUsage;
 use crate::cli::Evaluate;
@@ -87,7 +87,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
         let truth = Truth::new(log.truth.clone());
         let mount = super::mount(bag, log);
         for &seed in &arguments.seed {
-            let localizer = Localizer::new(
+            let localizer = SynPf::new(
                 Arc::clone(&map),
                 mount.base_link_from_laser,
                 set.parameters.clone(),
@@ -143,7 +143,7 @@ fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
 }
 
 fn over_bag(
-    mut localizer: Localizer,
+    mut localizer: SynPf,
     log: &SensorLog,
     truth: &Truth,
     start: Start,

@@ -11,7 +11,7 @@ use protocol::{
     Action, Answer, Candidate, Command, CommandId, EventKind, Header, Outcome, ParamsAction, RatesAction,
     RelocalizeAction, Reply, Stamps, Topic, decode, encode,
 };
-use synpf::{Localizer, Parameters, TrackMap, Tuning};
+use synpf::{Parameters, SynPf, TrackMap, Tuning};
 
 use super::answers::{Answered, Answers, Print};
 use super::file::StateFile;
@@ -310,7 +310,7 @@ impl Clerk {
             };
         };
         self.desk.track_map.prepare(self.believed(), &parameters);
-        let localizer = Localizer::new(
+        let localizer = SynPf::new(
             Arc::clone(&self.desk.track_map),
             self.desk.base_link_from_laser,
             *parameters,

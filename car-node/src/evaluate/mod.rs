@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use maps::Pose;
 use serde::Serialize;
-use synpf::{Dropped, Localizer, SetUpError, Stamp, Update};
+use synpf::{Dropped, PoseError, Stamp, SynPf, Update};
 
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
@@ -102,12 +102,12 @@ pub enum EvaluateError {
     NoTruth,
     /// The pose to start from is refused.
     #[error(transparent)]
-    Start(#[from] SetUpError),
+    Start(#[from] PoseError),
 }
 
 /// Runs `localizer` over `arrivals`. `observe` sees every update and the share of the log done so far.
 pub fn run(
-    localizer: &mut Localizer,
+    localizer: &mut SynPf,
     arrivals: &[Arrival],
     truth: &Truth,
     start: Start,
@@ -186,7 +186,7 @@ pub fn run(
 }
 
 /// Gives the localizer its start; `now` is the latest odometry's stamp.
-fn begin(localizer: &mut Localizer, truth: &Truth, start: Start, now: Stamp) -> Result<(), EvaluateError> {
+fn begin(localizer: &mut SynPf, truth: &Truth, start: Start, now: Stamp) -> Result<(), EvaluateError> {
     match start {
         Start::Pose(pose) => localizer.initialize(pose)?,
         Start::Truth => localizer.initialize(truth.at(now).ok_or(EvaluateError::NoTruth)?)?,

@@ -15,7 +15,7 @@ use maps::{Pose, wrap_angle};
 use serde::{Deserialize, Serialize};
 use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
 
-use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
+use synpf::{Odometry, Parameters, Scan, SetUpError, Stamp, SynPf, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, Mishap, MishapKind, RaceSummary};
@@ -178,7 +178,7 @@ struct Crew {
 }
 
 enum RunningGuide {
-    SynPf(Box<Localizer>, Box<Monitor>),
+    SynPf(Box<SynPf>, Box<Monitor>),
     /// `map_from_odom`, once it is known.
     Odometry(Option<Pose>, Pose),
     Truth,
@@ -202,7 +202,7 @@ impl Crew {
                 let parameters = Parameters::clone(parameters);
                 // A car's tables are ready before it starts.
                 map.prepare(Some(start), &parameters);
-                let mut localizer = Localizer::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
+                let mut localizer = SynPf::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
                 localizer.initialize(start)?;
                 let mut monitor = Monitor::new(Thresholds::default(), stamp(world.now()));
                 monitor.on_new_pose(stamp(world.now()));

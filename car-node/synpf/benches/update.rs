@@ -15,11 +15,11 @@ use std::time::Duration;
 use common::{BASE_LINK_FROM_LASER, odometry, ring, scan, truth};
 use criterion::{BatchSize, BenchmarkId, Criterion, criterion_group, criterion_main};
 use maps::DistanceField;
-use synpf::{Localizer, Parameters, Scan, Stage, TrackMap};
+use synpf::{Parameters, Scan, Stage, SynPf, TrackMap};
 
 /// A localizer with a drive that never ends, one update per call.
 struct Drive {
-    localizer: Localizer,
+    localizer: SynPf,
     scans: Vec<Scan>,
     /// Between two scans [s].
     period: f64,
@@ -30,7 +30,7 @@ struct Drive {
 impl Drive {
     fn new(map: &Arc<TrackMap>, parameters: Parameters) -> Self {
         let mut localizer =
-            Localizer::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, 1).expect("a sound set");
+            SynPf::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, 1).expect("a sound set");
         localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
         localizer.initialize(truth(0.0)).expect("finite");
         // One lap in whole scans, which the benchmark goes around again and again.

@@ -11,6 +11,8 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use localizer::ParameterFault;
+
 use crate::beams::BeamParameters;
 use crate::defects::Defects;
 use crate::motion::MotionParameters;
@@ -19,16 +21,6 @@ use crate::recovery::RecoveryParameters;
 use crate::refine::RefinementParameters;
 use crate::search::SearchParameters;
 use crate::sensor::SensorParameters;
-
-/// What is wrong with one parameter.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{key}: {fault}")]
-pub struct ParameterFault {
-    /// The parameter's name.
-    pub key: String,
-    /// What is wrong with it, with the value and what is allowed.
-    pub fault: String,
-}
 
 /// Everything that can be tuned.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

@@ -4,7 +4,7 @@ mod common;
 
 use allocation_counter::measure;
 use common::{BASE_LINK_FROM_LASER, odometry, ring, scan, truth};
-use synpf::{Localizer, Parameters, Scan};
+use synpf::{Parameters, Scan, SynPf};
 
 /// Updates until every buffer has its size.
 const WARM: usize = 400;
@@ -14,8 +14,7 @@ const MEASURED: usize = 200;
 fn allocations(set: &str) -> u64 {
     let map = ring();
     let parameters = Parameters::named(set).expect("ships");
-    let mut localizer =
-        Localizer::new(map.clone(), BASE_LINK_FROM_LASER, parameters, 1).expect("a sound set");
+    let mut localizer = SynPf::new(map.clone(), BASE_LINK_FROM_LASER, parameters, 1).expect("a sound set");
     localizer.on_odometry(&odometry(0.0, 1.02)).expect("sound");
     localizer.initialize(truth(0.0)).expect("finite");
     let scans: Vec<Scan> = (1..=WARM + MEASURED)

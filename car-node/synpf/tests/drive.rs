@@ -8,12 +8,12 @@ use common::{BASE_LINK_FROM_LASER, new_ring, odometry, ring, scan, truth};
 use maps::{Pose, wrap_angle};
 use proptest::prelude::*;
 use synpf::{
-    Dropped, Localizer, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModel, Stamp, TrackMap, Twist,
+    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModel, Stamp, SynPf, TrackMap, Twist,
     Update, YawRate,
 };
 
-fn localizer(map: &Arc<TrackMap>, parameters: Parameters, seed: u64) -> Localizer {
-    Localizer::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, seed).expect("sound")
+fn localizer(map: &Arc<TrackMap>, parameters: Parameters, seed: u64) -> SynPf {
+    SynPf::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, seed).expect("sound")
 }
 
 fn named(name: &str) -> Parameters {
@@ -21,7 +21,7 @@ fn named(name: &str) -> Parameters {
 }
 
 /// Drives from `from` to `to` [s] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
-fn drive(localizer: &mut Localizer, map: &TrackMap, from: f64, to: f64, scale: f64) -> Vec<Update> {
+fn drive(localizer: &mut SynPf, map: &TrackMap, from: f64, to: f64, scale: f64) -> Vec<Update> {
     let (mut odom, mut next, mut updates) = (from, from, Vec::new());
     while next < to {
         while odom <= next {
@@ -159,7 +159,7 @@ fn a_kidnapped_car_says_so_and_recovers() {
 }
 
 /// A localizer that has followed the track for a second.
-fn driven(map: &Arc<TrackMap>, seed: u64) -> Localizer {
+fn driven(map: &Arc<TrackMap>, seed: u64) -> SynPf {
     let mut localizer = localizer(map, named("hq"), seed);
     localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
     localizer.initialize(truth(0.0)).expect("finite");

@@ -23,7 +23,7 @@ use protocol::{
     Action, Answer, Command, CommandId, Event, EventKind, Header, LinkReport, Message, Outcome, ParameterSet,
     Params, ParamsAction, Pose2, Rates, RatesAction, RelocalizeAction, Stamps, Topic, Value, decode, encode,
 };
-use synpf::{Localizer, Odometry, Parameters, Scan, Stamp, TrackMap, Twist};
+use synpf::{Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist};
 
 /// What can happen to a car. Numbers come with all their bits: NaN, infinities, subnormals.
 #[derive(Debug, Arbitrary)]
@@ -271,8 +271,7 @@ impl Car {
             None => Parameters::named(&name).expect("ships, or was stored"),
         };
         let mount = Pose::new(0.27, 0.0, 0.0);
-        let mut localizer =
-            Localizer::new(Arc::clone(map()), mount, parameters.clone(), 1).expect("a sound set");
+        let mut localizer = SynPf::new(Arc::clone(map()), mount, parameters.clone(), 1).expect("a sound set");
         localizer
             .initialize(map().grid().origin * Pose::new(1.0, 1.0, 0.0))
             .expect("on the map");

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use arbitrary::{Arbitrary, Unstructured};
 use maps::{Cell, OccupancyGrid, Pose};
-use synpf::{Localizer, Odometry, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
+use synpf::{Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist, YawRate};
 
 /// What can happen to a localizer. Floats come with all their bits: NaN, infinities, subnormals.
 #[derive(Debug, Arbitrary)]
@@ -78,7 +78,7 @@ pub(crate) fn check(bytes: &[u8]) -> usize {
     set.particles.min_particles = 16;
     let keys: Vec<String> = set.to_values().into_keys().collect();
     let mut localizer =
-        Localizer::new(Arc::clone(map()), Pose::new(0.27, 0.0, 0.0), set, seed).expect("a sound set");
+        SynPf::new(Arc::clone(map()), Pose::new(0.27, 0.0, 0.0), set, seed).expect("a sound set");
     let (mut now, mut odom) = (1_000_000_000_i64, Pose::IDENTITY);
     let ahead = |now: i64, ms: i16| Stamp(now + i64::from(ms) * 1_000_000);
     let (mut events, mut updates) = (0, 0);
@@ -203,7 +203,7 @@ pub(crate) fn check(bytes: &[u8]) -> usize {
 }
 
 /// Takes in a scan; true when it led to an update.
-fn take(localizer: &mut Localizer, scan: &Scan) -> bool {
+fn take(localizer: &mut SynPf, scan: &Scan) -> bool {
     let mut updated = false;
     if let Ok(update) = localizer.on_scan(scan) {
         updated = true;

@@ -6,7 +6,6 @@ use std::sync::Arc;
 
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
-use serde::{Deserialize, Serialize};
 
 #[doc(hidden)]
 pub use self::stages::Stage;
@@ -23,7 +22,10 @@ use crate::slip_model::SlipModel;
 use crate::surprise::Surprise;
 use crate::walls::Walls;
 use crate::weigh::{Ranges, Weigher};
-use crate::{Odometry, ParameterFault, Parameters, Scan, Stamp, TrackMap, Twist, YawRate};
+use crate::{
+    Dropped, HandOver, Hypothesis, Localizer, Mode, Odometry, ParameterFault, ParameterValues, Parameters,
+    PoseError, PreparedParameters, Scan, Stamp, TrackMap, Twist, Update, WeightedPose, YawRate,
+};
 
 /// Why a localizer could not be set up.
 #[derive(Debug, thiserror::Error)]
@@ -39,122 +41,9 @@ pub enum SetUpError {
     /// A parameter set with faults, all of them.
     #[error("parameter set refused: {}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Parameters(Vec<ParameterFault>),
-    /// A pose with a NaN or an infinity.
-    #[error("pose {0:?} is not finite")]
-    Pose(Pose),
-    /// A pose that is nowhere on the map.
-    #[error("pose ({:.2}, {:.2}) is off the map", .0.x, .0.y)]
-    OffMap(Pose),
-}
-
-/// Why a message did not lead to an update. Each is counted by the caller.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, thiserror::Error,
-)]
-#[serde(rename_all = "snake_case")]
-pub enum Dropped {
-    /// A NaN or an infinity where a number must be, or a scan geometry that makes no sense.
-    #[error("malformed message")]
-    Malformed,
-    /// Its stamp is not later than the last one of its kind.
-    #[error("time went backwards")]
-    TimeBackwards,
-    /// A scan before the first odometry.
-    #[error("no odometry yet")]
-    NoOdometry,
-    /// A scan so long after the last odometry that the motion in between is unknown.
-    #[error("odometry is too old")]
-    StaleOdometry,
-    /// A scan without a single usable beam.
-    #[error("no usable beam")]
-    NoBeams,
-    /// There is no pose to start from: neither given nor searched for.
-    #[error("no initial pose")]
-    NotInitialized,
-}
-
-/// What the localizer is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Mode {
-    /// Waiting for an initial pose.
-    Uninitialized,
-    /// Following one hypothesis.
-    Tracking,
-    /// Searching the whole map.
-    Searching,
-}
-
-/// A particle, for drawing.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct WeightedPose {
-    /// `map_from_base_link`.
-    pub pose: Pose,
-    /// Share of the whole weight, in [0, 1].
-    pub weight: f64,
-}
-
-/// The outcome of one scan.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Update {
-    /// The time at which the pose is true: the scan's stamp.
-    pub stamp: Stamp,
-    /// Counts updates since the localizer was made, from 1.
-    pub number: u64,
-    /// `map_from_base_link`.
-    pub pose: Pose,
-    /// Velocity at that time.
-    pub twist: Twist,
-    /// Covariance of x, y [m^2], heading [rad^2] and between them, in `map`.
-    pub covariance: Matrix3<f64>,
-    /// What the localizer is doing.
-    pub mode: Mode,
-    /// Particles in use.
-    pub particles: usize,
-    /// Effective sample size over the number of particles, after weighing and before resampling, in (0, 1].
-    pub ess_ratio: f64,
-    /// Standard deviation of the particles along and across the car's heading [m].
-    pub spread: [f64; 2],
-    /// Mass of the second cluster of particles over that of the first, in [0, 1] (clusters of 0.5 m and 20 deg).
-    pub second_mode: f64,
-    /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall, in [0, 1]. A beam is valid that
-    /// has a return, and does not leave the mapped part of the world, as through a door that was shut when it was mapped.
-    pub alignment: f64,
-    /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
-    pub residual: f64,
-    /// Share of the valid beams more than 0.3 m shorter than the map says: something stands in view.
-    pub short_beams: f64,
-    /// Share of the valid beams more than 0.3 m longer than the map says: wrong pose, or a wall has gone.
-    pub long_beams: f64,
-    /// Share of the beams without a return.
-    pub no_return: f64,
-    /// `w_fast / w_slow` of augmented MCL (Probabilistic Robotics, table 8.3); 1 when all is as usual.
-    pub w_ratio: f64,
-    /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
-    pub innovation: [f64; 2],
-    /// By how far odometry has jumped since the update before [m], [rad]; None when it has not.
-    pub odometry_jump: Option<[f64; 2]>,
-    /// Slip: (odometry's distance - the posterior's) / odometry's, over the last 0.3 s; positive when the wheels
-    /// spin; 0 below walking speed.
-    pub slip: f64,
-    /// Odometry's yaw rate less the posterior's, over the last 0.3 s [rad/s].
-    pub yaw_rate_residual: f64,
-}
-
-/// A pose that a search has found, for the operator to choose from.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hypothesis {
-    /// `map_from_base_link`.
-    pub pose: Pose,
-    /// Log-likelihood of the last scans there, less than or equal to 0.
-    pub score: f64,
-}
-
-impl Hypothesis {
-    /// How well the end points of the last scans lie on walls there, in `[0, 1]`.
-    pub fn fit(&self) -> f64 {
-        (self.score / INDEPENDENT).exp()
-    }
+    /// A mount or a pose that cannot be.
+    #[error(transparent)]
+    Pose(#[from] PoseError),
 }
 
 /// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.
@@ -179,7 +68,7 @@ const FIT_MARGIN: f64 = 0.08;
 ///
 /// Inside, poses are in the grid's frame; see [`TrackMap`].
 #[derive(Debug, Clone)]
-pub struct Localizer {
+pub struct SynPf {
     map: Arc<TrackMap>,
     base_link_from_laser: Pose,
     parameters: Parameters,
@@ -218,7 +107,7 @@ struct PerOdometry {
     have_scan: bool,
 }
 
-impl Localizer {
+impl SynPf {
     /// A localizer on `map` for a laser mounted at `base_link_from_laser`. It has no pose yet.
     pub fn new(
         map: Arc<TrackMap>,
@@ -227,7 +116,7 @@ impl Localizer {
         seed: u64,
     ) -> Result<Self, SetUpError> {
         if !base_link_from_laser.is_finite() {
-            return Err(SetUpError::Pose(base_link_from_laser));
+            return Err(PoseError::NotFinite(base_link_from_laser).into());
         }
         parameters.validate().map_err(SetUpError::Parameters)?;
         let weigher = Weigher::new(&parameters, map.grid().resolution);
@@ -265,12 +154,12 @@ impl Localizer {
 
     /// Starts from a pose of `base_link` in `map`, true at the latest odometry (or, before there is any, at the
     /// first scan), with the set's initial spread. Fails for a pose that is not finite or not on the map's image.
-    pub fn initialize(&mut self, pose: Pose) -> Result<(), SetUpError> {
+    pub fn initialize(&mut self, pose: Pose) -> Result<(), PoseError> {
         if !pose.is_finite() {
-            return Err(SetUpError::Pose(pose));
+            return Err(PoseError::NotFinite(pose));
         }
         if !self.map.covers(pose) {
-            return Err(SetUpError::OffMap(pose));
+            return Err(PoseError::OffMap(pose));
         }
         self.map.prepare(Some(pose), &self.parameters);
         let particles = &self.parameters.particles;
@@ -318,13 +207,13 @@ impl Localizer {
         let map_from_grid = self.map.grid().origin;
         let public = |candidate: &crate::search::Candidate| Hypothesis {
             pose: map_from_grid * candidate.estimate.pose,
-            score: candidate.score,
+            fit: (candidate.score / INDEPENDENT).exp(),
         };
         self.search.candidates.iter().map(public).collect()
     }
 
     /// Swaps the parameter set between two updates; the particles stay. On `Err` nothing has changed. Builds the
-    /// tables of the sensor model, which takes some milliseconds; see [`Localizer::tune`] to have that done elsewhere.
+    /// tables of the sensor model, which takes some milliseconds; see [`SynPf::tune`] to have that done elsewhere.
     pub fn set_parameters(&mut self, parameters: Parameters) -> Result<(), Vec<ParameterFault>> {
         self.tune(Tuning::new(parameters, &self.map)?);
         Ok(())
@@ -783,6 +672,65 @@ impl Localizer {
             pose: map_from_grid * Pose::new(p.x[i].into(), p.y[i].into(), p.heading[i].into()),
             weight: p.weight[i].into(),
         })
+    }
+}
+
+impl Localizer for SynPf {
+    fn initialize(&mut self, pose: Pose) -> Result<(), PoseError> {
+        Self::initialize(self, pose)
+    }
+
+    fn relocalize(&mut self) {
+        Self::relocalize(self);
+    }
+
+    fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
+        Self::on_odometry(self, odometry)
+    }
+
+    fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
+        Self::on_yaw_rate(self, yaw_rate)
+    }
+
+    fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {
+        Self::on_scan(self, scan)
+    }
+
+    fn predict(&self, stamp: Stamp) -> Option<Pose> {
+        Self::predict(self, stamp)
+    }
+
+    fn particles(&self, most: usize) -> Vec<WeightedPose> {
+        let step = self.particles.len().div_ceil(most.max(1)).max(1);
+        Self::particles(self).step_by(step).collect()
+    }
+
+    fn hypotheses(&self) -> Vec<Hypothesis> {
+        Self::hypotheses(self)
+    }
+
+    fn parameters(&self) -> ParameterValues {
+        self.parameters.to_values()
+    }
+
+    fn set_parameters(&mut self, prepared: PreparedParameters) -> Result<(), PreparedParameters> {
+        self.tune(*prepared.downcast::<Tuning>()?);
+        Ok(())
+    }
+
+    fn hand_over(&self) -> HandOver {
+        HandOver {
+            estimate: None,
+            odometry: Vec::new(),
+            yaw_rates: Vec::new(),
+            last_scan: self.last_scan,
+            updates: self.number,
+        }
+    }
+
+    fn take_over(&mut self, from: HandOver) {
+        self.number = from.updates;
+        self.last_scan = from.last_scan;
     }
 }
 

@@ -2,14 +2,14 @@
 
 use maps::Pose;
 
-use super::Localizer;
+use super::SynPf;
 use crate::Scan;
 use crate::motion::Motion;
 use crate::particles::Belief;
 use crate::quality::Quality;
 use crate::seed::seed;
 
-/// A part of [`Localizer::on_scan`].
+/// A part of [`SynPf::on_scan`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
     /// The scan checked, deskewed and its beams chosen.
@@ -43,7 +43,7 @@ impl Stage {
     ];
 }
 
-impl Localizer {
+impl SynPf {
     /// Runs one stage on the state that the last update left. What it does to that state is no update: throw the
     /// localizer away.
     pub fn run_stage(&mut self, stage: Stage, scan: &Scan) {

@@ -55,11 +55,11 @@ pub fn endpoint(text: &str) -> Result<String, String> {
             .as_str()
             .rsplit_once(':')
             .map(|(_, port)| port.parse::<u16>());
-        ["tcp", "tls", "udp"].contains(&endpoint.protocol().as_str()) && matches!(port, Some(Ok(_)))
+        ["tcp", "tls"].contains(&endpoint.protocol().as_str()) && matches!(port, Some(Ok(_)))
     });
     match endpoint {
         Some(_) => Ok(text.into()),
-        None => Err("should be tcp/HOST:PORT (or tls, udp), as in tcp/192.168.1.10:7447".into()),
+        None => Err("should be tcp/HOST:PORT (or tls), as in tcp/192.168.1.10:7447".into()),
     }
 }
 

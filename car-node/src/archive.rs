@@ -43,8 +43,8 @@ impl Archive {
         }
     }
 
-    /// What there is of what is missing, as much of it as the budget allows. `session` is this run of the node.
-    pub fn find(&self, session: u64, request: &MissingRequest) -> MissingReply {
+    /// What there is of what is missing, as much of it as the budget allows. `run_id` is that of this run of the node.
+    pub fn find(&self, run_id: u64, request: &MissingRequest) -> MissingReply {
         let streams = self.0.iter().map(|(topic, shelf)| Kept {
             topic: *topic,
             first: shelf.first,
@@ -55,7 +55,7 @@ impl Archive {
         let wanted = request
             .streams
             .iter()
-            .filter(|_| request.session == session)
+            .filter(|_| request.run_id == run_id)
             .filter_map(|wanted| Some((wanted.topic, &wanted.ranges, self.0.get(&wanted.topic)?)))
             .flat_map(|(topic, ranges, shelf)| shelf.within(ranges).map(move |bytes| (topic, bytes)));
         let messages = wanted
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
     use protocol::Wanted;
 
-    const SESSION: u64 = 7;
+    const RUN: u64 = 7;
 
     fn archive(numbers: std::ops::RangeInclusive<u64>, len: usize) -> Archive {
         let mut archive = Archive::default();
@@ -103,16 +103,16 @@ mod tests {
         archive
     }
 
-    fn ask(archive: &Archive, session: u64, ranges: &[[u64; 2]], budget: u32) -> MissingReply {
+    fn ask(archive: &Archive, run_id: u64, ranges: &[[u64; 2]], budget: u32) -> MissingReply {
         let request = MissingRequest {
-            session,
+            run_id,
             streams: vec![Wanted {
                 topic: Topic::Event,
                 ranges: ranges.to_vec(),
             }],
             budget,
         };
-        archive.find(SESSION, &request)
+        archive.find(RUN, &request)
     }
 
     fn numbers(reply: &MissingReply) -> Vec<u8> {
@@ -122,7 +122,7 @@ mod tests {
     #[test]
     fn what_is_missing_comes_in_order_and_within_the_budget() {
         let archive = archive(1..=9, 100);
-        let reply = ask(&archive, SESSION, &[[2, 3], [6, 20]], 1000);
+        let reply = ask(&archive, RUN, &[[2, 3], [6, 20]], 1000);
         assert_eq!(numbers(&reply), [2, 3, 6, 7, 8, 9]);
         let kept = Kept {
             topic: Topic::Event,
@@ -130,12 +130,9 @@ mod tests {
             last: 9,
         };
         assert_eq!(reply.streams, [kept]);
+        assert_eq!(numbers(&ask(&archive, RUN, &[[2, 3], [6, 20]], 399)), [2, 3, 6]);
         assert_eq!(
-            numbers(&ask(&archive, SESSION, &[[2, 3], [6, 20]], 399)),
-            [2, 3, 6]
-        );
-        assert_eq!(
-            numbers(&ask(&archive, SESSION, &[[4, 9]], 0)),
+            numbers(&ask(&archive, RUN, &[[4, 9]], 0)),
             [4],
             "one comes in any case"
         );
@@ -149,9 +146,9 @@ mod tests {
                 .filter(|n| (ranges[0]..=ranges[1]).contains(n))
                 .map(|n| n as u8)
                 .collect();
-            assert_eq!(numbers(&ask(&archive, SESSION, &[ranges], u32::MAX)), expected);
+            assert_eq!(numbers(&ask(&archive, RUN, &[ranges], u32::MAX)), expected);
         }
-        let other = ask(&archive, SESSION + 1, &[[0, 9]], u32::MAX);
+        let other = ask(&archive, RUN + 1, &[[0, 9]], u32::MAX);
         assert_eq!(other.messages, [], "numbers of another run of the node");
         assert_eq!((other.streams[0].first, other.streams[0].last), (5, 6));
     }
@@ -159,7 +156,7 @@ mod tests {
     #[test]
     fn the_oldest_go_when_it_is_full() {
         let archive = archive(1..=30, 1 << 20);
-        let reply = ask(&archive, SESSION, &[[1, 30]], 0);
+        let reply = ask(&archive, RUN, &[[1, 30]], 0);
         assert_eq!((reply.streams[0].first, reply.streams[0].last), (7, 30));
         assert_eq!(numbers(&reply), [7]);
     }

@@ -25,7 +25,7 @@ pub struct Library {
     /// Where questions that cannot be read are counted.
     pub shared: Arc<Shared>,
     /// This run of the node.
-    pub session_number: u64,
+    pub run_id: u64,
 }
 
 impl Library {
@@ -73,12 +73,12 @@ impl Library {
         let payload = payload.ok_or("this question needs a payload")?;
         let (_, request) = decode::<MissingRequest>(payload).map_err(|error| error.to_string())?;
         let archive = self.archive.lock().unwrap_or_else(PoisonError::into_inner);
-        let reply = archive.find(self.session_number, &request);
+        let reply = archive.find(self.run_id, &request);
         // A recording ends here: what is published later is not among the last numbers.
         let now = wall_now().0;
         drop(archive);
         let stamps = Stamps {
-            session: self.session_number,
+            run_id: self.run_id,
             sequence: 0,
             sensor: now,
             published: now,

@@ -217,7 +217,7 @@ impl Node {
 
         let session = link::open(&connect)?;
         let started = wall_now();
-        let session_number = started.0.unsigned_abs();
+        let run_id = started.0.unsigned_abs();
         let shared = Arc::new(Shared {
             rates: Mutex::new(rates),
             ..Shared::default()
@@ -229,7 +229,7 @@ impl Node {
         let publisher = Publisher::new(
             &session,
             &car,
-            session_number,
+            run_id,
             clock,
             Arc::clone(&shared),
             Arc::clone(&archive),
@@ -287,7 +287,7 @@ impl Node {
                 base_link_from_laser: mount.base_link_from_laser,
                 shared: Arc::clone(&shared),
                 clock,
-                session_number,
+                run_id,
                 track_map: map.map,
                 search_patience: desk::SEARCH_PATIENCE,
             },
@@ -299,11 +299,11 @@ impl Node {
             info,
             archive,
             shared: Arc::clone(&shared),
-            session_number,
+            run_id,
         };
         let library = library.start(looked_up, desk_stops.clone())?;
         let load = load::start(Arc::clone(&shared), desk_stops)?;
-        let queryables = declare_queryables(&session, &car, session_number, &inquiries, &look_ups, &shared)?;
+        let queryables = declare_queryables(&session, &car, run_id, &inquiries, &look_ups, &shared)?;
         let reports = declare_reports(&session, &car, &shared, clock)?;
         let alive = link::declare_alive(&session, &car)?;
         // The sensors last: from the first scan on, everybody can watch.
@@ -388,16 +388,16 @@ fn describe(
     source: &dyn Source,
     started: synpf::Stamp,
 ) -> Result<(Vec<u8>, Vec<u8>), protocol::CodecError> {
-    let session = started.0.unsigned_abs();
+    let run_id = started.0.unsigned_abs();
     let stamps = Stamps {
-        session,
+        run_id,
         sequence: 1,
         sensor: started.0,
         published: started.0,
     };
     let info = CarInfo {
         version: env!("CARGO_PKG_VERSION").into(),
-        started: session,
+        started: run_id,
         source: source.description(),
         map: map.name.clone(),
         lap_length: map.raceline.as_ref().map(|line| line.length()),
@@ -443,7 +443,7 @@ fn begin_at(localizer: &mut SynPf, begin: Begin, start: Option<Pose>) -> Result<
 fn declare_queryables(
     session: &Session,
     car: &CarName,
-    session_number: u64,
+    run_id: u64,
     inquiries: &Sender<Inquiry>,
     look_ups: &Sender<Inquiry>,
     shared: &Arc<Shared>,
@@ -461,7 +461,7 @@ fn declare_queryables(
     };
     let mut queryables = vec![declare(Topic::Clock, {
         let shared = Arc::clone(shared);
-        Box::new(move |query| answer_clock(&query, session_number, &shared))
+        Box::new(move |query| answer_clock(&query, run_id, &shared))
     })?];
     for topic in [
         Topic::Map,
@@ -535,7 +535,7 @@ fn declare_reports(
         })
 }
 
-fn answer_clock(query: &Query, session_number: u64, shared: &Shared) {
+fn answer_clock(query: &Query, run_id: u64, shared: &Shared) {
     let received = wall_now();
     let request = query
         .payload()
@@ -553,7 +553,7 @@ fn answer_clock(query: &Query, session_number: u64, shared: &Shared) {
         answered: wall_now().0,
     };
     let stamps = Stamps {
-        session: session_number,
+        run_id,
         sequence: 1,
         sensor: received.0,
         published: reply.answered,

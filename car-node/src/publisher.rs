@@ -46,7 +46,7 @@ struct Stream {
 /// Sends a car's telemetry.
 pub struct Publisher {
     streams: HashMap<Topic, Stream>,
-    session_number: u64,
+    run_id: u64,
     clock: SensorClock,
     shared: Arc<Shared>,
     archive: Arc<Mutex<Archive>>,
@@ -54,11 +54,11 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Declares every topic on `session`. `session_number` tells this run of the node from others.
+    /// Declares every topic on `session`. `run_id` tells this run of the node from others.
     pub fn new(
         session: &Session,
         car: &CarName,
-        session_number: u64,
+        run_id: u64,
         clock: SensorClock,
         shared: Arc<Shared>,
         archive: Arc<Mutex<Archive>>,
@@ -72,7 +72,7 @@ impl Publisher {
             .collect::<Result<_, LinkError>>()?;
         Ok(Self {
             streams,
-            session_number,
+            run_id,
             clock,
             shared,
             archive,
@@ -175,7 +175,7 @@ impl Publisher {
             return;
         };
         let stamps = Stamps {
-            session: self.session_number,
+            run_id: self.run_id,
             sequence: stream.sequence + 1,
             sensor: sensor.0,
             published: wall_now().0,

@@ -81,7 +81,7 @@ impl Wall {
             action,
         };
         let stamps = Stamps {
-            session: 1,
+            run_id: 1,
             sequence: 1,
             sensor: 0,
             published: 0,
@@ -161,7 +161,7 @@ fn a_car_is_seen_from_its_first_pose_to_its_end() {
     let (first, pose) = next::<Pose>(&poses, |_| true);
     assert!(pose.track.is_some(), "the raceline is known");
     let (later, pose) = next::<Pose>(&poses, |pose| pose.update > 40);
-    assert_eq!(later.session, first.session);
+    assert_eq!(later.run_id, first.run_id);
     assert!(pose.pose.x.is_finite());
     assert!(later.sensor > first.sensor && later.published > later.sensor);
     next::<Health>(&health, |health| {
@@ -318,7 +318,7 @@ fn rubbish_is_refused_and_the_car_drives_on() {
     let mut rubbish: Vec<Vec<u8>> = vec![vec![], vec![0; 3], vec![0xff; 100_000], b"SYPF".to_vec()];
     // Bytes from a fixed sequence, some of them with a sound header in front.
     let stamps = Stamps {
-        session: 1,
+        run_id: 1,
         sequence: 1,
         sensor: 0,
         published: 0,
@@ -499,9 +499,9 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
 fn what_did_not_arrive_can_be_asked_for() {
     let wall = Wall::open();
     let (node, car) = start_and_wait("hotel", &wall, |_| ());
-    let ask = |session: u64, ranges: Vec<[u64; 2]>| {
+    let ask = |run_id: u64, ranges: Vec<[u64; 2]>| {
         let request = MissingRequest {
-            session,
+            run_id,
             streams: vec![Wanted {
                 topic: Topic::Event,
                 ranges,
@@ -517,7 +517,7 @@ fn what_did_not_arrive_can_be_asked_for() {
         decode::<MissingReply>(&reply).expect("a MissingReply")
     };
     let (header, reply) = ask(0, vec![[1, 1]]);
-    assert_eq!(reply.messages, [], "of another session");
+    assert_eq!(reply.messages, [], "of another run");
     // Every stream that must be whole is kept, as soon as it has begun.
     let begun = Instant::now();
     for topic in Topic::all().filter(|topic| topic.recovered()) {
@@ -530,7 +530,7 @@ fn what_did_not_arrive_can_be_asked_for() {
             assert!(begun.elapsed() < DEADLINE, "{topic} is not kept");
         }
     }
-    let (_, reply) = ask(header.session, vec![[1, 1]]);
+    let (_, reply) = ask(header.run_id, vec![[1, 1]]);
     let [first] = &reply.messages[..] else {
         panic!("{reply:?}");
     };

@@ -42,13 +42,13 @@ const MOST_HOLES: usize = 4096;
 
 const SECOND: i64 = 1_000_000_000;
 
-/// A number in a stream of a car's session.
+/// A number in a stream of a car's run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Place {
     /// The stream.
     pub(crate) topic: Topic,
     /// See [`protocol::Header`].
-    pub(crate) session: u64,
+    pub(crate) run_id: u64,
     /// See [`protocol::Header`]; 0 is not counted.
     pub(crate) number: u64,
 }
@@ -83,7 +83,7 @@ impl<T> Default for CatchUp<T> {
 
 #[derive(Debug)]
 struct Car<T> {
-    session: Option<u64>,
+    run_id: Option<u64>,
     streams: BTreeMap<Topic, Stream<T>>,
     /// When it was asked what it has not answered yet [unix ns].
     asked: Option<i64>,
@@ -98,7 +98,7 @@ struct Car<T> {
 enum LastCall {
     /// It was made at this time, and is not answered yet [unix ns].
     Made(i64),
-    /// The car's session, and the last number of each stream.
+    /// The car's run id, and the last number of each stream.
     Answered(u64, Vec<Sent>),
     /// Nobody answered.
     Silent,
@@ -126,7 +126,7 @@ impl Outstanding {
 impl<T> Default for Car<T> {
     fn default() -> Self {
         Self {
-            session: None,
+            run_id: None,
             streams: BTreeMap::new(),
             asked: None,
             due: 0,
@@ -184,12 +184,12 @@ impl<T> CatchUp<T> {
     pub(crate) fn arrive(&mut self, car: &CarName, place: Place, message: T, at: i64) -> Vec<T> {
         let Place {
             topic,
-            session,
+            run_id,
             number,
         } = place;
         let car = self.cars.entry(car.clone()).or_default();
-        let mut out = car.follow(session);
-        if number == 0 || car.session.is_some_and(|known| session < known) {
+        let mut out = car.follow(run_id);
+        if number == 0 || car.run_id.is_some_and(|known| run_id < known) {
             out.push(message);
         } else {
             let stream = car.streams.entry(topic).or_insert_with(|| Stream::new(false));
@@ -242,7 +242,7 @@ impl<T> CatchUp<T> {
                 streams.sort_by_key(|wanted| car.streams.get(&wanted.topic).map(Stream::since));
             }
             let request = MissingRequest {
-                session: car.session.unwrap_or_default(),
+                run_id: car.run_id.unwrap_or_default(),
                 streams,
                 budget: car.budget,
             };
@@ -260,14 +260,14 @@ impl<T> CatchUp<T> {
     pub(crate) fn answered(
         &mut self,
         car: &CarName,
-        session: u64,
+        run_id: u64,
         kept: &[Kept],
         more: bool,
         now: i64,
     ) -> (Vec<T>, Option<Vec<Sent>>) {
         let recorded = self.recorded;
         let car = self.cars.entry(car.clone()).or_default();
-        let mut out = car.follow(session);
+        let mut out = car.follow(run_id);
         let answers_last_call = car.answers_last_call();
         if let Some(asked) = car.asked.take() {
             let [least, most] = BUDGET;
@@ -295,7 +295,7 @@ impl<T> CatchUp<T> {
             }
         }
         if answers_last_call {
-            car.last_call = Some(LastCall::Answered(session, sent.clone()));
+            car.last_call = Some(LastCall::Answered(run_id, sent.clone()));
         }
         let missing = car.streams.values().any(|stream| !stream.holes.is_empty());
         car.due = match (missing, more, &car.last_call) {
@@ -324,10 +324,10 @@ impl<T> CatchUp<T> {
 
 impl<T> Car<T> {
     /// Follows a car that began anew; returns what was held back of what it was before.
-    fn follow(&mut self, session: u64) -> Vec<T> {
+    fn follow(&mut self, run_id: u64) -> Vec<T> {
         let mut out = Vec::new();
-        match self.session {
-            Some(known) if session <= known => return out,
+        match self.run_id {
+            Some(known) if run_id <= known => return out,
             Some(_) => {
                 // What we have followed begins with number 1 again.
                 for stream in self.streams.values_mut() {
@@ -338,7 +338,7 @@ impl<T> Car<T> {
             }
             None => {}
         }
-        self.session = Some(session);
+        self.run_id = Some(run_id);
         out
     }
 
@@ -349,10 +349,10 @@ impl<T> Car<T> {
 
     /// Messages to come of those that the car had sent when it answered the last call.
     fn outstanding(&self) -> u64 {
-        let Some(LastCall::Answered(session, sent)) = &self.last_call else {
+        let Some(LastCall::Answered(run_id, sent)) = &self.last_call else {
             return 0;
         };
-        let streams = sent.iter().filter(|_| self.session == Some(*session));
+        let streams = sent.iter().filter(|_| self.run_id == Some(*run_id));
         streams
             .filter_map(|sent| Some(self.streams.get(&sent.topic)?.lacks_up_to(sent.to)))
             .sum()
@@ -511,7 +511,7 @@ impl<T> Stream<T> {
 mod tests {
     use super::*;
 
-    const SESSION: u64 = 5;
+    const RUN: u64 = 5;
     const TOPIC: Topic = Topic::RecordedScan;
 
     struct Wall {
@@ -538,11 +538,11 @@ mod tests {
             }
         }
 
-        fn arrive_in(&mut self, session: u64, numbers: impl IntoIterator<Item = u64>) {
+        fn arrive_in(&mut self, run_id: u64, numbers: impl IntoIterator<Item = u64>) {
             for number in numbers {
                 let place = Place {
                     topic: TOPIC,
-                    session,
+                    run_id,
                     number,
                 };
                 self.out
@@ -551,7 +551,7 @@ mod tests {
         }
 
         fn arrive(&mut self, numbers: impl IntoIterator<Item = u64>) {
-            self.arrive_in(SESSION, numbers);
+            self.arrive_in(RUN, numbers);
         }
 
         /// Asks what is due and answers with the last number, and up to so many messages.
@@ -576,9 +576,7 @@ mod tests {
                 last,
             };
             let more = !sent.is_empty();
-            let (out, sent) = self
-                .catch_up
-                .answered(&self.car, SESSION, &[kept], more, self.now);
+            let (out, sent) = self.catch_up.answered(&self.car, RUN, &[kept], more, self.now);
             self.out.extend(out);
             self.sent.extend(sent);
             ranges
@@ -688,7 +686,7 @@ mod tests {
         assert_eq!(early.len(), 1);
         wall.wait(0.1);
         wall.catch_up.last_call(wall.now);
-        let (_, sent) = wall.catch_up.answered(&wall.car, SESSION, &[], false, wall.now);
+        let (_, sent) = wall.catch_up.answered(&wall.car, RUN, &[], false, wall.now);
         assert_eq!((sent, wall.outstanding()), (None, (1, 0)));
         wall.ask(1, 1, 0);
         assert_eq!(wall.outstanding(), (0, 1));
@@ -715,14 +713,14 @@ mod tests {
         wall.arrive([1]);
         wall.ask(1, 1, 0);
         wall.arrive([3]);
-        wall.arrive_in(SESSION + 1, [2]);
+        wall.arrive_in(RUN + 1, [2]);
         assert_eq!(wall.out, [1, 3], "what was held back is all there will be");
         let question = wall.catch_up.due(wall.now).pop().expect("is due");
-        assert_eq!(question.request.session, SESSION + 1);
+        assert_eq!(question.request.run_id, RUN + 1);
         assert_eq!(question.request.streams[0].ranges, [[1, 1]]);
-        wall.arrive_in(SESSION, [2]);
+        wall.arrive_in(RUN, [2]);
         assert_eq!(wall.out, [1, 3, 2], "a straggler");
-        wall.arrive_in(SESSION + 1, [1]);
+        wall.arrive_in(RUN + 1, [1]);
         assert_eq!(wall.out, [1, 3, 2, 1, 2]);
     }
 
@@ -734,7 +732,7 @@ mod tests {
                 wall.wait(2.0);
                 let question = wall.catch_up.due(wall.now).pop().expect("is due");
                 wall.wait(took);
-                wall.catch_up.answered(&wall.car, SESSION, &[], false, wall.now);
+                wall.catch_up.answered(&wall.car, RUN, &[], false, wall.now);
                 question.request.budget
             })
             .to_vec();

@@ -69,8 +69,8 @@ pub enum Happening {
     },
     /// The car has said how far its streams go, because a recording is about to end: here.
     HowFar {
-        /// Its session.
-        session: u64,
+        /// Its run id.
+        run_id: u64,
         /// When it said so, by its own clock [unix ns].
         said: i64,
         /// The streams that must be whole of which something is still to come.

@@ -226,7 +226,7 @@ mod tests {
 
     fn message(at: i64, sequence: u64, lane: Lane, topic: Topic, telemetry: Telemetry) -> FleetEvent {
         let stamps = Stamps {
-            session: 1,
+            run_id: 1,
             sequence,
             sensor: at,
             published: at,

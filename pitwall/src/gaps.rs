@@ -7,17 +7,17 @@ use serde::Serialize;
 /// The arrivals of one stream: one sender, one key.
 ///
 /// Counting begins with the first message that comes in: what was sent before that is not missing. A sender that
-/// starts again, which its session tells, begins a new count; what was missing of the old one stays missing.
+/// starts again has a new run id and begins a new count; what was missing of the old one stays missing.
 #[derive(Debug, Clone, Default)]
 pub struct Gaps {
-    session: u64,
+    run_id: u64,
     first: u64,
     last: u64,
     received: u64,
     restarts: u64,
-    /// Missing ranges of the present session, ascending.
+    /// Missing ranges of the present run, ascending.
     missing: Vec<RangeInclusive<u64>>,
-    /// Missing numbers of sessions before, and of ranges that no longer fit the list.
+    /// Missing numbers of earlier runs, and of ranges that no longer fit the list.
     missing_before: u64,
     filled: u64,
 }
@@ -40,16 +40,16 @@ impl Gaps {
     const MAX_RANGES: usize = 4096;
 
     /// Takes note of a message. Those with sequence number 0 are not counted.
-    pub fn arrive(&mut self, session: u64, sequence: u64) -> Arrival {
+    pub fn arrive(&mut self, run_id: u64, sequence: u64) -> Arrival {
         if sequence == 0 {
             return Arrival::New;
         }
-        if self.last == 0 || session > self.session {
-            self.begin(session, sequence);
+        if self.last == 0 || run_id > self.run_id {
+            self.begin(run_id, sequence);
             self.received += 1;
             return Arrival::New;
         }
-        if session < self.session {
+        if run_id < self.run_id {
             return Arrival::Repeated;
         }
         if sequence > self.last {
@@ -75,12 +75,12 @@ impl Gaps {
     }
 
     /// Takes note that the messages up to number `to` were sent. Where none has come yet, the count begins with `from`.
-    pub fn sent(&mut self, session: u64, from: u64, to: u64) {
-        if session < self.session || to < from || from == 0 {
+    pub fn sent(&mut self, run_id: u64, from: u64, to: u64) {
+        if run_id < self.run_id || to < from || from == 0 {
             return;
         }
-        if self.last == 0 || session > self.session {
-            self.begin(session, from);
+        if self.last == 0 || run_id > self.run_id {
+            self.begin(run_id, from);
             self.miss(from..=to);
         } else if to > self.last {
             self.miss(self.last + 1..=to);
@@ -88,8 +88,8 @@ impl Gaps {
         self.last = self.last.max(to);
     }
 
-    /// Begins with this number of a session.
-    fn begin(&mut self, session: u64, number: u64) {
+    /// Begins with this number of a run.
+    fn begin(&mut self, run_id: u64, number: u64) {
         if self.last > 0 {
             self.restarts += 1;
             self.missing_before += self.missing_now();
@@ -99,7 +99,7 @@ impl Gaps {
                 self.missing.push(1..=number - 1);
             }
         }
-        self.session = session;
+        self.run_id = run_id;
         self.first = number;
         self.last = number;
     }
@@ -158,7 +158,7 @@ impl Gaps {
 /// What came of a stream and what did not.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct GapSummary {
-    /// The number with which the count begins, of the sender's last session.
+    /// The number with which the count begins, of the sender's last run.
     pub first: u64,
     /// The highest number that came or is known to have been sent.
     pub last: u64,
@@ -166,7 +166,7 @@ pub struct GapSummary {
     pub received: u64,
     /// Messages missing in all.
     pub missing: u64,
-    /// The missing numbers of the sender's last session, as `[from, to]`.
+    /// The missing numbers of the sender's last run, as `[from, to]`.
     pub missing_ranges: Vec<[u64; 2]>,
     /// Messages that came late.
     pub filled_late: u64,
@@ -213,7 +213,7 @@ mod tests {
         assert_eq!(
             gaps.arrive(1, 2),
             Arrival::Repeated,
-            "a straggler of the old session"
+            "a straggler of the old run_id"
         );
         let summary = gaps.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (3, 1));
@@ -241,7 +241,7 @@ mod tests {
         let summary = nothing_came.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (4, 1));
         nothing_came.sent(1, 1, 9);
-        assert_eq!(nothing_came.summary(), summary, "a straggler of the old session");
+        assert_eq!(nothing_came.summary(), summary, "a straggler of the old run_id");
     }
 
     #[test]

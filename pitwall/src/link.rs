@@ -449,7 +449,7 @@ impl Decoding {
         };
         let place = Place {
             topic: received.key.topic,
-            session: header.session,
+            run_id: header.run_id,
             number: header.sequence,
         };
         let (car, at) = (received.key.car.clone(), received.at);
@@ -471,13 +471,13 @@ impl Decoding {
                 bytes: bytes.into(),
             });
         }
-        let (released, how_far) = self.catch_up.answered(&car, header.session, &streams, more, at);
+        let (released, how_far) = self.catch_up.answered(&car, header.run_id, &streams, more, at);
         if let Some(streams) = how_far {
             (self.sink)(FleetEvent {
                 at,
                 car,
                 happening: Happening::HowFar {
-                    session: header.session,
+                    run_id: header.run_id,
                     said: header.published,
                     streams,
                 },

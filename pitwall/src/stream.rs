@@ -18,8 +18,8 @@ pub struct Stream {
     unreadable: u64,
     /// The newest message of all, where that one could not be read.
     refused: Option<Header>,
-    /// Session and number of messages that could not be read, until one of a later number can: only that one proves that
-    /// there is such a session.
+    /// Run id and number of messages that could not be read, until one of a later number can: only that one proves that
+    /// there is such a run.
     unproven: BTreeSet<(u64, u64)>,
     late_by: f64,
     /// Of the last second: when each arrived [unix ns], and how late [s].
@@ -48,20 +48,20 @@ impl Stream {
 
     /// Takes note of a message that arrived at `at` [unix ns].
     pub fn arrive(&mut self, header: &Header, at: i64) -> Taken {
-        let order = |h: &Header| (h.session, h.sequence);
+        let order = |h: &Header| (h.run_id, h.sequence);
         let later = self.unproven.split_off(&order(header));
-        for (session, sequence) in std::mem::replace(&mut self.unproven, later) {
-            if session == header.session {
-                self.gaps.arrive(session, sequence);
+        for (run_id, sequence) in std::mem::replace(&mut self.unproven, later) {
+            if run_id == header.run_id {
+                self.gaps.arrive(run_id, sequence);
             }
         }
-        let arrival = self.gaps.arrive(header.session, header.sequence);
+        let arrival = self.gaps.arrive(header.run_id, header.sequence);
         if arrival == Arrival::Repeated {
             return Taken::Repeated;
         }
         let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
         if newer {
-            if self.newest.is_some_and(|newest| newest.session != header.session) {
+            if self.newest.is_some_and(|newest| newest.run_id != header.run_id) {
                 self.published.clear();
             }
             if self.published.len() == Self::WINDOW {
@@ -85,7 +85,7 @@ impl Stream {
     pub fn refuse(&mut self, header: Option<&Header>) -> u64 {
         self.unreadable += 1;
         if let Some(header) = header {
-            let order = |h: &Header| (h.session, h.sequence);
+            let order = |h: &Header| (h.run_id, h.sequence);
             if self.newest.is_none_or(|newest| order(header) > order(&newest)) {
                 self.refused = Some(*header);
                 self.unproven.insert(order(header));
@@ -93,8 +93,8 @@ impl Stream {
                     self.unproven.pop_first();
                 }
             } else {
-                // In the present session it fills its gap; one of a session before is left alone.
-                self.gaps.arrive(header.session, header.sequence);
+                // In the present run it fills its gap; one of an earlier run is left alone.
+                self.gaps.arrive(header.run_id, header.sequence);
             }
         }
         self.unreadable
@@ -198,7 +198,7 @@ mod tests {
 
     fn published(sequence: u64, published: i64) -> Header {
         let stamps = Stamps {
-            session: 1,
+            run_id: 1,
             sequence,
             sensor: 0,
             published,
@@ -257,7 +257,7 @@ mod tests {
     fn an_unreadable_header_of_nobody_stops_no_stream() {
         let mut stream = Stream::default();
         let mut forged = header(u64::MAX);
-        forged.session = u64::MAX;
+        forged.run_id = u64::MAX;
         for number in 1..4 {
             stream.refuse(Some(&forged));
             assert_eq!(stream.arrive(&header(number), 0), Taken::Newest);

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! offset  0        4         6          8          16          24             32                40
-//!         | "SYPF" | schema  | version  | session  | sequence  | sensor time  | publish time    |
+//!         | "SYPF" | schema  | version  | run id   | sequence  | sensor time  | publish time    |
 //!         | 4      | u16     | u16      | u64      | u64       | i64 unix ns  | i64 unix ns     |
 //! ```
 //! All numbers are little-endian.
@@ -14,9 +14,9 @@ use crate::Schema;
 /// What a sender says of each message beside its content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Stamps {
-    /// Tells one run of the sender from the next: the unix time of its start [ns]. Sequence numbers start anew
-    /// with each.
-    pub session: u64,
+    /// Identifies a run: the life of one sending process. It is the unix time of the process's start \[ns\].
+    /// Sequence numbers start again at 1 with each run.
+    pub run_id: u64,
     /// Counts the messages of this sender on this key, from 1. 0 where nothing is counted (questions, commands).
     pub sequence: u64,
     /// When the content was true: the sensor's stamp [unix ns].
@@ -32,8 +32,9 @@ pub struct Header {
     pub schema: Schema,
     /// Version of the payload's layout.
     pub version: u16,
-    /// See [`Stamps::session`].
-    pub session: u64,
+    /// See [`Stamps::run_id`]. JSON of older recordings calls it `session`.
+    #[serde(alias = "session")]
+    pub run_id: u64,
     /// See [`Stamps::sequence`].
     pub sequence: u64,
     /// See [`Stamps::sensor`].
@@ -51,7 +52,7 @@ impl Header {
     /// A header for a message of `schema`.
     pub fn new(schema: Schema, version: u16, stamps: Stamps) -> Self {
         let Stamps {
-            session,
+            run_id,
             sequence,
             sensor,
             published,
@@ -59,7 +60,7 @@ impl Header {
         Self {
             schema,
             version,
-            session,
+            run_id,
             sequence,
             sensor,
             published,
@@ -72,7 +73,7 @@ impl Header {
         bytes[0..4].copy_from_slice(&Self::MAGIC);
         bytes[4..6].copy_from_slice(&(self.schema as u16).to_le_bytes());
         bytes[6..8].copy_from_slice(&self.version.to_le_bytes());
-        bytes[8..16].copy_from_slice(&self.session.to_le_bytes());
+        bytes[8..16].copy_from_slice(&self.run_id.to_le_bytes());
         bytes[16..24].copy_from_slice(&self.sequence.to_le_bytes());
         bytes[24..32].copy_from_slice(&self.sensor.to_le_bytes());
         bytes[32..40].copy_from_slice(&self.published.to_le_bytes());
@@ -92,7 +93,7 @@ impl Header {
         Ok(Self {
             schema: Schema::from_id(schema).ok_or(HeaderError::Schema(schema))?,
             version: u16::from_le_bytes([bytes[6], bytes[7]]),
-            session: u64::from_le_bytes(field(8)),
+            run_id: u64::from_le_bytes(field(8)),
             sequence: u64::from_le_bytes(field(16)),
             sensor: i64::from_le_bytes(field(24)),
             published: i64::from_le_bytes(field(32)),
@@ -126,9 +127,9 @@ mod tests {
         #[test]
         fn read_undoes_to_bytes(
             schema in proptest::sample::select(Schema::ALL.to_vec()),
-            version: u16, session: u64, sequence: u64, sensor: i64, published: i64,
+            version: u16, run_id: u64, sequence: u64, sensor: i64, published: i64,
         ) {
-            let header = Header { schema, version, session, sequence, sensor, published };
+            let header = Header { schema, version, run_id, sequence, sensor, published };
             prop_assert_eq!(Header::read(&header.to_bytes()), Ok(header));
         }
 

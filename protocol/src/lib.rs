@@ -28,7 +28,7 @@
 //! assert_eq!(key.to_string(), "synpf/v1/car-1/recorded/truth");
 //!
 //! let truth = Truth { pose: Pose2 { x: 1.0, y: 2.0, heading: 0.5 }, twist: Twist2::default() };
-//! let bytes = encode(&truth, Stamps { session: 1, sequence: 1, sensor: 0, published: 0 })?;
+//! let bytes = encode(&truth, Stamps { run_id: 1, sequence: 1, sensor: 0, published: 0 })?;
 //! let (header, back) = decode::<Truth>(&bytes)?;
 //! assert_eq!((header.sequence, back), (1, truth));
 //! # Ok::<(), Box<dyn std::error::Error>>(())

@@ -53,7 +53,7 @@ struct CarState {
     archive: Archive,
     set: SetRef,
     who: String,
-    session: u64,
+    run_id: u64,
 }
 
 impl CarState {
@@ -62,7 +62,7 @@ impl CarState {
         *sequence += 1;
         let now = unix_now();
         Stamps {
-            session: self.session,
+            run_id: self.run_id,
             sequence: *sequence,
             sensor: now - 2_000_000,
             published: now,
@@ -95,7 +95,7 @@ impl FakeCar {
                 revision: 1,
             },
             who: "start".into(),
-            session: unix_now() as u64,
+            run_id: unix_now() as u64,
         }));
         let running = Arc::new(AtomicBool::new(true));
         let topics = Topics::declare(&session, &name, behaviour).await;
@@ -490,9 +490,9 @@ async fn answer_questions(
                 return;
             };
             let state = sent.lock().expect("no panic");
-            let reply = state.archive.find(state.session, &request);
+            let reply = state.archive.find(state.run_id, &request);
             let stamps = Stamps {
-                session: state.session,
+                run_id: state.run_id,
                 published: unix_now(),
                 ..Stamps::default()
             };

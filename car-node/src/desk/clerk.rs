@@ -55,7 +55,7 @@ pub struct Desk {
     /// The sensors' time, for events.
     pub clock: SensorClock,
     /// This run of the node.
-    pub session_number: u64,
+    pub run_id: u64,
     /// The map, to make sets ready for it.
     pub track_map: Arc<TrackMap>,
     /// A search of the map answers with what it has after this time.
@@ -123,7 +123,7 @@ impl Clerk {
             None => self.obey(&command, print),
         };
         let stamps = Stamps {
-            session: self.desk.session_number,
+            run_id: self.desk.run_id,
             sequence: self.sequence + 1,
             sensor: wall_now().0,
             published: wall_now().0,

@@ -302,7 +302,7 @@ impl Car {
             base_link_from_laser: mount,
             shared: Arc::clone(&shared),
             clock,
-            session_number: 7,
+            run_id: 7,
             track_map: Arc::clone(map()),
             search_patience: Duration::ZERO,
         });

@@ -27,7 +27,7 @@ struct Recorded {
     until: Moment,
 }
 
-/// A moment of a car: its session, and its clock [unix ns].
+/// A moment of a car: its run id, and its clock [unix ns].
 type Moment = (u64, i64);
 
 /// How far a car's streams go: what it published later is not recorded, so that they all end together.
@@ -76,14 +76,14 @@ impl<W: Write + Seek> RecordingFile<W> {
                 bytes,
                 ..
             } => {
-                let published = (header.session, header.published);
+                let published = (header.run_id, header.published);
                 if self.ends.get(car).is_some_and(|end| published > *end) {
                     return Ok(());
                 }
                 let key = Key::new(car.clone(), *topic);
                 let name = key.to_string();
                 let stream = self.streams.entry(key).or_default();
-                if stream.gaps.arrive(header.session, header.sequence) == Arrival::Repeated {
+                if stream.gaps.arrive(header.run_id, header.sequence) == Arrival::Repeated {
                     return Ok(());
                 }
                 stream.until = stream.until.max(published);
@@ -111,14 +111,14 @@ impl<W: Write + Seek> RecordingFile<W> {
                 self.write_json(car, &foxglove::export_map(map, *at), times)?;
             }
             Happening::HowFar {
-                session,
+                run_id,
                 said,
                 streams,
             } => {
-                self.ends.insert(car.clone(), (*session, *said));
+                self.ends.insert(car.clone(), (*run_id, *said));
                 for Sent { topic, from, to } in streams {
                     let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
-                    stream.gaps.sent(*session, *from, *to);
+                    stream.gaps.sent(*run_id, *from, *to);
                 }
                 return Ok(());
             }

@@ -90,3 +90,23 @@ impl From<Note> for Happening {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // The header's field `run_id` was once called `session`.
+    #[test]
+    fn notes_of_older_recordings_are_read() {
+        let json = r#"{"note":"unreadable","topic":"event","header":{"schema":"Event","version":3,
+            "session":7,"sequence":5,"sensor":1,"published":2},"error":"damaged"}"#;
+        let note: Note = serde_json::from_str(json).expect("a note");
+        let Note::Unreadable {
+            header: Some(header), ..
+        } = note
+        else {
+            panic!("{note:?}");
+        };
+        assert_eq!((header.run_id, header.sequence), (7, 5));
+    }
+}

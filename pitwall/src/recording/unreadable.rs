@@ -84,7 +84,7 @@ mod tests {
             command: None,
         };
         let stamps = Stamps {
-            session: 1,
+            run_id: 1,
             sequence: number,
             ..Stamps::default()
         };

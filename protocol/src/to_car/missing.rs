@@ -15,9 +15,9 @@ use crate::{Invalid, Message, Schema, Topic};
 /// Asks for messages by number.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MissingRequest {
-    /// The sender's session that the numbers belong to. Of another one the car sends no messages, and its own session in
-    /// the header of the answer.
-    pub session: u64,
+    /// The run of the car that the numbers belong to. A car in another run sends no messages; the header of its
+    /// answer carries its own run id.
+    pub run_id: u64,
     /// What is missing, the most urgent stream first, at most [`MissingRequest::MAX_STREAMS`].
     pub streams: Vec<Wanted>,
     /// How long the messages in the answer may be together [bytes]. One comes in any case.

@@ -9,7 +9,7 @@ use crate::{Message, Pose2, Schema};
 pub struct CarInfo {
     /// Version of the node.
     pub version: String,
-    /// Start of the node [unix ns]; the `session` of its messages.
+    /// Start of the node, in ns since 1970. It is the [`run_id`](crate::Header::run_id) of its messages.
     pub started: u64,
     /// Where the sensor data comes from, in words.
     pub source: String,

@@ -57,7 +57,7 @@ fn as_everything(bytes: &[u8]) {
 fn there_and_back<M: Message>(bytes: &[u8]) {
     if let Ok((header, message)) = decode::<M>(bytes) {
         let stamps = Stamps {
-            session: header.session,
+            run_id: header.run_id,
             sequence: header.sequence,
             sensor: header.sensor,
             published: header.published,

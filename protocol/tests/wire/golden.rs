@@ -6,7 +6,7 @@ use protocol::*;
 use crate::samples;
 
 const STAMPS: Stamps = Stamps {
-    session: 1,
+    run_id: 1,
     sequence: 2,
     sensor: 3,
     published: 4,
@@ -56,7 +56,7 @@ fn topics_keep_their_numbers() {
     let tags: Vec<_> = Topic::all()
         .map(|topic| {
             let request = MissingRequest {
-                session: 0,
+                run_id: 0,
                 streams: vec![Wanted {
                     topic,
                     ranges: Vec::new(),
@@ -64,7 +64,7 @@ fn topics_keep_their_numbers() {
                 budget: 0,
             };
             let bytes = encode(&request, STAMPS).expect("a good message");
-            // Session 8, the list's length 8.
+            // Run id 8, the list's length 8.
             let tag = bytes[Header::LEN + 16..].first_chunk().expect("a tag");
             u32::from_le_bytes(*tag)
         })

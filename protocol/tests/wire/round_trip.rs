@@ -7,8 +7,8 @@ use protocol::*;
 use crate::{any_bytes, samples};
 
 fn stamps() -> impl Strategy<Value = Stamps> {
-    any::<(u64, u64, i64, i64)>().prop_map(|(session, sequence, sensor, published)| Stamps {
-        session,
+    any::<(u64, u64, i64, i64)>().prop_map(|(run_id, sequence, sensor, published)| Stamps {
+        run_id,
         sequence,
         sensor,
         published,

@@ -493,7 +493,7 @@ pub(crate) fn all() -> Vec<Vec<u8>> {
 /// Two streams, the first with two holes.
 pub(crate) fn missing_request() -> MissingRequest {
     MissingRequest {
-        session: 7,
+        run_id: 7,
         streams: vec![
             Wanted {
                 topic: Topic::Event,

@@ -15,19 +15,19 @@ use crate::range_table::DIRECTIONS;
 /// Directions over half a turn.
 pub(crate) const HALF_TURN: usize = DIRECTIONS / 2;
 
-/// Lanes per cell.
+/// CddtSlice per cell.
 const FINE: f32 = 2.0;
 
-/// Lanes for every direction over half a turn.
+/// CddtSlice for every direction over half a turn.
 #[derive(Debug)]
 pub(crate) struct Cddt {
-    directions: Vec<Lanes>,
+    directions: Vec<CddtSlice>,
 }
 
 impl Cddt {
     pub(crate) fn new(field: &DistanceField) -> Self {
         let faces = field.contour();
-        let direction = |k| Lanes::new(&faces, std::f64::consts::PI * k as f64 / HALF_TURN as f64);
+        let direction = |k| CddtSlice::new(&faces, std::f64::consts::PI * k as f64 / HALF_TURN as f64);
         Self {
             directions: (0..HALF_TURN).into_par_iter().map(direction).collect(),
         }
@@ -43,14 +43,14 @@ impl Cddt {
 
     /// Memory that it takes [bytes].
     pub(crate) fn bytes(&self) -> usize {
-        let bytes = |lanes: &Lanes| size_of_val(&*lanes.starts) + size_of_val(&*lanes.fours);
+        let bytes = |lanes: &CddtSlice| size_of_val(&*lanes.starts) + size_of_val(&*lanes.fours);
         self.directions.iter().map(bytes).sum()
     }
 }
 
 /// The walls as seen along one direction.
 #[derive(Debug)]
-pub(crate) struct Lanes {
+pub(crate) struct CddtSlice {
     /// Unit vector along the lanes.
     along: [f32; 2],
     /// Offset across the lanes of lane 0 [lanes].
@@ -59,7 +59,7 @@ pub(crate) struct Lanes {
     starts: Vec<u32>,
     /// Crossings of the lanes' middles with faces, sorted along each lane, with one at minus infinity before them
     /// and plus infinity up to the end of the last four.
-    fours: Vec<Four>,
+    fours: Vec<CrossingBlock>,
 }
 
 /// A crossing of a lane's middle with a face.
@@ -72,14 +72,14 @@ struct Crossing {
     slope: f32,
 }
 
-/// Four crossings, compared at once.
+/// CrossingBlock crossings, compared at once.
 #[derive(Debug, Clone, Copy)]
-struct Four {
+struct CrossingBlock {
     at: [f32; 4],
     slope: [f32; 4],
 }
 
-impl Lanes {
+impl CddtSlice {
     pub(crate) fn new(faces: &[[[f32; 2]; 2]], angle: f64) -> Self {
         let along = [angle.cos() as f32, angle.sin() as f32];
         let across = |p: &[f32; 2]| (p[1] * along[0] - p[0] * along[1]) * FINE;
@@ -139,7 +139,7 @@ impl Lanes {
             // A handful, most of them in order.
             sorted[4 * *start as usize..*end as usize].sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
         }
-        let four = |four: &[(f32, f32)]| Four {
+        let four = |four: &[(f32, f32)]| CrossingBlock {
             at: std::array::from_fn(|i| four[i].0),
             slope: std::array::from_fn(|i| four[i].1),
         };

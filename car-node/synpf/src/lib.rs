@@ -3,41 +3,49 @@
 //! Sensor data goes in ([`SynPf::on_odometry`], [`SynPf::on_scan`]), poses come out. The crate reads
 //! no file, no clock and no network, and every random number comes from the seed: the same seed and the
 //! same log give the same bytes.
-mod beams;
+mod beam_layout;
+mod beam_model;
 mod cddt;
 mod defects;
-mod motion;
+mod likelihood_field;
+mod motion_model;
+mod normal_pool;
 mod odometry_track;
 mod parameters;
+mod particle_estimate;
 mod particles;
+mod pose_array;
+mod pose_bins;
+mod preprocessed_scan;
 mod quality;
 mod range_table;
+mod ranges;
 mod recovery;
 mod refine;
+mod resampling;
 mod search;
 mod seed;
-mod sensor;
+mod sensor_model;
 mod slip;
 mod slip_model;
 mod surprise;
 mod synpf;
 mod track_map;
 mod walls;
-mod weigh;
 
-pub use beams::{BeamLayout, BeamParameters};
+pub use beam_layout::{BeamLayout, BeamParameters};
 pub use defects::Defects;
 pub use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
     ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose, YawRate,
 };
-pub use motion::{MotionModel, MotionParameters};
+pub use motion_model::{MotionModel, MotionParameters};
 pub use parameters::Parameters;
 pub use particles::ParticleParameters;
 pub use recovery::RecoveryParameters;
 pub use refine::RefinementParameters;
 pub use search::SearchParameters;
-pub use sensor::{RangeMethod, SensorModel, SensorParameters};
+pub use sensor_model::{RangeMethod, SensorModelKind, SensorParameters};
 #[doc(hidden)]
 pub use synpf::Stage;
 pub use synpf::{SetUpError, SynPf, Tuning};

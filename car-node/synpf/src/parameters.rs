@@ -13,14 +13,14 @@ use serde_json::Value;
 
 use localizer::ParameterFault;
 
-use crate::beams::BeamParameters;
+use crate::beam_layout::BeamParameters;
 use crate::defects::Defects;
-use crate::motion::MotionParameters;
+use crate::motion_model::MotionParameters;
 use crate::particles::ParticleParameters;
 use crate::recovery::RecoveryParameters;
 use crate::refine::RefinementParameters;
 use crate::search::SearchParameters;
-use crate::sensor::SensorParameters;
+use crate::sensor_model::SensorParameters;
 
 /// Everything that can be tuned.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

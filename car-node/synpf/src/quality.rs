@@ -3,7 +3,7 @@
 use maps::Pose;
 
 use crate::TrackMap;
-use crate::beams::ReadyScan;
+use crate::preprocessed_scan::PreprocessedScan;
 
 /// The fit of one scan at one pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -40,7 +40,7 @@ impl Quality {
 
     /// Judges a scan at a pose in the grid's frame. Beams that end where nothing was mapped ([`TrackMap::unmapped`]) are not
     /// valid: they say nothing on the pose. At most half of a scan is excused so.
-    pub(crate) fn new(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> Self {
+    pub(crate) fn new(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> Self {
         let field = map.field();
         let cells = 1.0 / field.resolution() as f32;
         let stride = scan.points.len().div_ceil(BEAMS).max(1);
@@ -111,7 +111,7 @@ pub(crate) mod tests {
     }
 
     /// What a laser sees all around; there is a wall 2.5 m behind the door.
-    pub(crate) fn scan(map: &TrackMap, pose: Pose) -> ReadyScan {
+    pub(crate) fn scan(map: &TrackMap, pose: Pose) -> PreprocessedScan {
         let points = (0..720).map(|i| {
             let angle = f64::from(i) * 0.5f64.to_radians();
             let direction = Pose::new(pose.x, pose.y, pose.heading + angle);
@@ -125,7 +125,7 @@ pub(crate) mod tests {
             };
             [(range * angle.cos()) as f32, (range * angle.sin()) as f32]
         });
-        let mut scan = ReadyScan::default();
+        let mut scan = PreprocessedScan::default();
         scan.points.extend(points);
         scan
     }

@@ -4,7 +4,7 @@ use maps::{DistanceField, OccupancyGrid};
 use rayon::prelude::*;
 use wide::{f32x8, i32x8};
 
-use crate::cddt::{HALF_TURN, Lanes};
+use crate::cddt::{CddtSlice, HALF_TURN};
 
 /// Directions that a table distinguishes; a power of two, so that headings wrap with a mask.
 pub(crate) const DIRECTIONS: usize = 256;
@@ -71,7 +71,7 @@ impl RangeTable {
                 let fill = |part: &mut [[[u16; STRETCH]; 2]], k: usize| {
                     let direction = (stretch * STRETCH + k) as f64 / DIRECTIONS as f64;
                     let steps = f64::from(parameters.directions);
-                    let lanes = Lanes::new(
+                    let lanes = CddtSlice::new(
                         &faces,
                         (direction * steps).round() / steps * std::f64::consts::TAU,
                     );

@@ -10,8 +10,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::TrackMap;
-use crate::beams::ReadyScan;
 use crate::parameters::{Check, Parameters};
+use crate::preprocessed_scan::PreprocessedScan;
 use crate::refine::{Estimate, RefinementParameters, fit_by, refine};
 use crate::seed::seed;
 use crate::surprise::Fall;
@@ -69,7 +69,7 @@ pub(crate) struct Candidate {
 
 impl Candidate {
     /// A candidate from one scan alone.
-    fn new(map: &TrackMap, scan: &ReadyScan, estimate: Estimate) -> Self {
+    fn new(map: &TrackMap, scan: &PreprocessedScan, estimate: Estimate) -> Self {
         Self {
             estimate,
             score: score(map, scan, estimate.pose),
@@ -119,7 +119,7 @@ impl Search {
     pub(crate) fn update(
         &mut self,
         map: &TrackMap,
-        scan: &ReadyScan,
+        scan: &PreprocessedScan,
         motion: Pose,
         seconds: f64,
         parameters: &Parameters,
@@ -198,7 +198,7 @@ impl Search {
     /// or where it drove while messages were missing. None when it stayed; else a search has begun with both.
     pub(crate) fn after_jump(
         map: &TrackMap,
-        scan: &ReadyScan,
+        scan: &PreprocessedScan,
         [stayed, moved]: [Pose; 2],
         parameters: &Parameters,
     ) -> Option<Self> {
@@ -243,7 +243,7 @@ impl Search {
     /// search can begin. `fall` says that the scan fits worse than usual.
     pub(crate) fn second_opinion(
         map: &TrackMap,
-        scan: &ReadyScan,
+        scan: &PreprocessedScan,
         pose: Pose,
         sudden: bool,
         fall: Option<Fall>,
@@ -320,7 +320,7 @@ fn explains(score: f64) -> bool {
 
 /// How well a scan's end points lie on walls at a pose, in [0, 1]: what scores are made of. A beam that ends where nothing
 /// was mapped speaks neither for the pose nor against it.
-pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
+pub(crate) fn fit_of(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> f64 {
     let laser = pose * scan.base_link_from_laser;
     let laser = [laser.x as f32, laser.y as f32];
     fit_by(map.field(), &scan.points, BEAMS, pose, 0.08, |weight, end| {
@@ -333,7 +333,7 @@ pub(crate) fn fit_of(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
 }
 
 /// Candidates from one scan alone.
-fn candidates(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<Candidate> {
+fn candidates(map: &TrackMap, scan: &PreprocessedScan, parameters: &Parameters) -> Vec<Candidate> {
     seed(map, &scan.points, &parameters.search)
         .into_par_iter()
         .map(|pose| Candidate::new(map, scan, fitted(map, scan, pose, parameters)))
@@ -341,7 +341,7 @@ fn candidates(map: &TrackMap, scan: &ReadyScan, parameters: &Parameters) -> Vec<
 }
 
 /// The fit of part of a scan near a pose that is known only coarsely.
-fn fitted(map: &TrackMap, scan: &ReadyScan, pose: Pose, parameters: &Parameters) -> Estimate {
+fn fitted(map: &TrackMap, scan: &PreprocessedScan, pose: Pose, parameters: &Parameters) -> Estimate {
     let prior = Estimate {
         pose,
         covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
@@ -369,7 +369,7 @@ fn same_way(a: Pose, b: Pose) -> bool {
 }
 
 /// Log-likelihood of a scan at a pose: the robust fit of its end points.
-fn score(map: &TrackMap, scan: &ReadyScan, pose: Pose) -> f64 {
+fn score(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> f64 {
     let on_track = map.field().nearest(
         (pose.x / map.grid().resolution) as f32,
         (pose.y / map.grid().resolution) as f32,

@@ -9,19 +9,22 @@ use nalgebra::{Matrix3, Vector3};
 
 #[doc(hidden)]
 pub use self::stages::Stage;
-use crate::beams::ReadyScan;
-use crate::motion::Motion;
+use crate::motion_model::Motion;
 use crate::odometry_track::OdometryTrack;
-use crate::particles::{Belief, Particles};
+use crate::particle_estimate::ParticleEstimate;
+use crate::particles::Particles;
+use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
+use crate::ranges::Ranges;
 use crate::recovery::Doubt;
 use crate::refine::{Estimate, fit, refine};
+use crate::resampling::Proposal;
 use crate::search::{INDEPENDENT, Search, fit_of};
+use crate::sensor_model::SensorModel;
 use crate::slip::{Slip, SlipWindow};
 use crate::slip_model::SlipModel;
 use crate::surprise::Surprise;
 use crate::walls::Walls;
-use crate::weigh::{Ranges, Weigher};
 use crate::{
     Dropped, HandOver, Hypothesis, Localizer, Mode, Odometry, ParameterFault, ParameterValues, Parameters,
     PoseError, PreparedParameters, Scan, Stamp, TrackMap, Twist, Update, WeightedPose, YawRate,
@@ -72,10 +75,10 @@ pub struct SynPf {
     map: Arc<TrackMap>,
     base_link_from_laser: Pose,
     parameters: Parameters,
-    weigher: Weigher,
+    sensor_model: SensorModel,
     ranges: Option<(usize, Ranges)>,
     track: OdometryTrack,
-    scan: ReadyScan,
+    scan: PreprocessedScan,
     particles: Particles,
     mode: Mode,
     /// The posterior at `at`, and odometry's pose there.
@@ -119,16 +122,16 @@ impl SynPf {
             return Err(PoseError::NotFinite(base_link_from_laser).into());
         }
         parameters.validate().map_err(SetUpError::Parameters)?;
-        let weigher = Weigher::new(&parameters, map.grid().resolution);
+        let sensor_model = SensorModel::new(&parameters, map.grid().resolution);
         let particles = Particles::new(seed, parameters.particles.max_particles);
         Ok(Self {
             map,
             base_link_from_laser,
             parameters,
-            weigher,
+            sensor_model,
             ranges: None,
             track: OdometryTrack::default(),
-            scan: ReadyScan::default(),
+            scan: PreprocessedScan::default(),
             particles,
             mode: Mode::Uninitialized,
             estimate: Estimate {
@@ -222,7 +225,7 @@ impl SynPf {
     /// Swaps in a parameter set made ready on another thread; takes no time.
     pub fn tune(&mut self, tuning: Tuning) {
         self.parameters = tuning.parameters;
-        self.weigher = tuning.weigher;
+        self.sensor_model = tuning.sensor_model;
         self.ranges = None;
     }
 
@@ -346,7 +349,7 @@ impl SynPf {
         ));
         self.weigh(predicted.pose);
         let sound = self.particles.normalize();
-        let belief = self.particles.belief();
+        let belief = self.particles.estimate();
 
         let before = self.estimate.pose;
         if self.parameters.refinement.refine && sound {
@@ -429,10 +432,13 @@ impl SynPf {
         let known = self.ranges.as_ref().map(|(of, _)| *of);
         let index = region.unwrap_or_else(|| known.unwrap_or(usize::MAX));
         if known != Some(index) {
-            self.ranges = Some((index, self.weigher.ranges(&self.map, region, &self.parameters)));
+            self.ranges = Some((
+                index,
+                self.sensor_model.ranges(&self.map, region, &self.parameters),
+            ));
         }
         if let Some((_, ranges)) = &self.ranges {
-            self.weigher.weigh(
+            self.sensor_model.reweight(
                 &mut self.particles,
                 &self.scan,
                 &self.map,
@@ -444,7 +450,7 @@ impl SynPf {
 
     /// The scan fitted around the prediction, or around the particles where they explain the scan better. Says whether
     /// the prediction was followed.
-    fn refined(&self, predicted: &Estimate, belief: &Belief) -> (Estimate, bool) {
+    fn refined(&self, predicted: &Estimate, belief: &ParticleEstimate) -> (Estimate, bool) {
         let parameters = &self.parameters.refinement;
         let field = self.map.field();
         let fit = |pose| fit(field, &self.scan.points, 60, pose, FIT_REACH);
@@ -488,7 +494,7 @@ impl SynPf {
         &mut self,
         stamp: Stamp,
         twist: Twist,
-        belief: Option<(Belief, f64)>,
+        belief: Option<(ParticleEstimate, f64)>,
         innovation: Pose,
     ) -> Update {
         self.number += 1;
@@ -587,33 +593,31 @@ impl SynPf {
         if ess_ratio > parameters.particles.resample_ess_ratio {
             return;
         }
-        let count = self.particles.wanted(&parameters.particles);
+        let count = self.particles.kld_sample_size(&parameters.particles);
         self.particles.resample(count);
-        let mut next = 0;
-        if parameters.refinement.refine {
-            let share = (parameters.refinement.refine_feedback * count as f64) as usize;
+        let feedback = parameters.refinement.refine.then(|| {
             let floor = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-5));
-            if let Some(root) = (self.estimate.covariance + floor).cholesky() {
-                let root = root.l();
-                for i in 0..share {
-                    let pose = self.particles.draw(self.estimate.pose, &root);
-                    self.particles.replace(i, pose);
-                }
-                next = share;
-            }
-        }
+            (self.estimate.covariance + floor).cholesky()
+        });
+        let feedback = feedback.flatten().map(|root| Proposal {
+            mean: self.estimate.pose,
+            root: root.l(),
+            share: parameters.refinement.refine_feedback,
+        });
         let recovery = &parameters.recovery;
-        if recovery.injection && self.w_ratio < recovery.injection_ratio {
-            let share = (recovery.injection_share * (1.0 - self.w_ratio) * count as f64) as usize;
+        let injected = (recovery.injection && self.w_ratio < recovery.injection_ratio).then(|| {
             // Along the track the estimate is most often wrong: slip, and walls without features.
             let along = Matrix3::from_diagonal(&Vector3::new(1.0, 0.2, 0.1));
             let (sin, cos) = self.estimate.pose.heading.sin_cos();
             let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
-            for i in next..(next + share).min(count) {
-                let pose = self.particles.draw(self.estimate.pose, &(turn * along));
-                self.particles.replace(i, pose);
+            Proposal {
+                mean: self.estimate.pose,
+                root: turn * along,
+                share: recovery.injection_share * (1.0 - self.w_ratio),
             }
-        }
+        });
+        self.particles
+            .replace_at_random(feedback.into_iter().chain(injected));
     }
 
     /// The reference's cycle: one update per odometry message, with the latest scan and the motion before the last.
@@ -639,7 +643,7 @@ impl SynPf {
         self.particles.log_weight.fill(0.0);
         self.weigh(self.estimate.pose);
         self.particles.normalize();
-        let belief = self.particles.belief();
+        let belief = self.particles.estimate();
         self.estimate = Estimate {
             pose: belief.mean,
             covariance: belief.covariance,
@@ -669,7 +673,7 @@ impl SynPf {
         let map_from_grid = self.map.grid().origin;
         let p = &self.particles;
         (0..p.len()).map(move |i| WeightedPose {
-            pose: map_from_grid * Pose::new(p.x[i].into(), p.y[i].into(), p.heading[i].into()),
+            pose: map_from_grid * p.poses.get(i),
             weight: p.weight[i].into(),
         })
     }
@@ -738,15 +742,18 @@ impl Localizer for SynPf {
 #[derive(Debug, Clone)]
 pub struct Tuning {
     parameters: Parameters,
-    weigher: Weigher,
+    sensor_model: SensorModel,
 }
 
 impl Tuning {
     /// Validates a set and builds its tables. Every fault is listed.
     pub fn new(parameters: Parameters, map: &TrackMap) -> Result<Self, Vec<ParameterFault>> {
         parameters.validate()?;
-        let weigher = Weigher::new(&parameters, map.grid().resolution);
-        Ok(Self { parameters, weigher })
+        let sensor_model = SensorModel::new(&parameters, map.grid().resolution);
+        Ok(Self {
+            parameters,
+            sensor_model,
+        })
     }
 }
 

@@ -8,7 +8,7 @@ use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 use crate::cddt::Cddt;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::seed::Blurred;
-use crate::sensor::RangeMethod;
+use crate::sensor_model::RangeMethod;
 use crate::{Parameters, SetUpError};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,

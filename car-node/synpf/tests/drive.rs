@@ -8,7 +8,7 @@ use common::{BASE_LINK_FROM_LASER, new_ring, odometry, ring, scan, truth};
 use maps::{Pose, wrap_angle};
 use proptest::prelude::*;
 use synpf::{
-    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModel, Stamp, SynPf, TrackMap, Twist,
+    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModelKind, Stamp, SynPf, TrackMap, Twist,
     Update, YawRate,
 };
 
@@ -78,7 +78,7 @@ fn every_model_and_method_follows_the_track() {
         sets.push(set);
     }
     let mut field = named("hq");
-    field.sensor.sensor_model = SensorModel::LikelihoodField;
+    field.sensor.sensor_model = SensorModelKind::LikelihoodField;
     sets.push(field);
     for mut set in sets {
         // The particles alone, without the refinement that would cover for them.

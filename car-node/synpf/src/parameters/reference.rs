@@ -54,8 +54,8 @@ pub(super) fn translate(key: &str, value: &Value) -> Vec<(String, Value)> {
 #[cfg(test)]
 mod tests {
     use crate::Parameters;
-    use crate::motion::MotionModel;
-    use crate::sensor::RangeMethod;
+    use crate::motion_model::MotionModel;
+    use crate::sensor_model::RangeMethod;
 
     #[test]
     fn the_references_keys_are_understood() {

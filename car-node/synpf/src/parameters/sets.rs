@@ -5,7 +5,7 @@
 
 use crate::Parameters;
 use crate::defects::Defects;
-use crate::motion::{MotionModel, MotionParameters};
+use crate::motion_model::{MotionModel, MotionParameters};
 use crate::refine::RefinementParameters;
 
 /// A set by name; see [`Parameters::NAMES`].

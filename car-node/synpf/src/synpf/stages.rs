@@ -4,8 +4,8 @@ use maps::Pose;
 
 use super::SynPf;
 use crate::Scan;
-use crate::motion::Motion;
-use crate::particles::Belief;
+use crate::motion_model::Motion;
+use crate::particle_estimate::ParticleEstimate;
 use crate::quality::Quality;
 use crate::seed::seed;
 
@@ -69,10 +69,10 @@ impl SynPf {
             Stage::Weigh => self.weigh(self.estimate.pose),
             Stage::Belief => {
                 self.particles.normalize();
-                std::hint::black_box(self.particles.belief());
+                std::hint::black_box(self.particles.estimate());
             }
             Stage::Refine => {
-                let belief = Belief {
+                let belief = ParticleEstimate {
                     mean: self.estimate.pose,
                     covariance: self.estimate.covariance,
                     ess_ratio: 1.0,

@@ -1,55 +1,11 @@
-//! From a scan to what the filter weighs and fits: end points at one time, and a choice of beams.
+//! Preprocessing of a scan: invalid readings dropped, end points deskewed to one time, and beams chosen.
 
 use maps::Pose;
-use serde::{Deserialize, Serialize};
 
+use crate::beam_layout::{BeamParameters, chosen_beams};
 use crate::odometry_track::OdometryTrack;
-use crate::parameters::Check;
 use crate::slip::Slip;
 use crate::{Dropped, Scan};
-
-/// How the beams to weigh are chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum BeamLayout {
-    /// At equal spacing along the outline of a corridor (Stahl et al., IV 2019): more beams look ahead, where
-    /// the information on the way along the track is.
-    Boxed,
-    /// At equal angles.
-    Uniform,
-}
-
-/// Parameters of the choice of beams.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct BeamParameters {
-    /// How they are chosen.
-    pub beam_layout: BeamLayout,
-    /// How many are weighed.
-    pub beams: usize,
-    /// Length over width of the corridor of the boxed layout.
-    pub lidar_aspect_ratio: f64,
-    /// Bring each beam to the scan's stamp by the odometry since; else all count as measured at once.
-    pub deskew: bool,
-}
-
-impl Default for BeamParameters {
-    fn default() -> Self {
-        Self {
-            beam_layout: BeamLayout::Boxed,
-            beams: 21,
-            lidar_aspect_ratio: 3.5,
-            deskew: true,
-        }
-    }
-}
-
-impl BeamParameters {
-    pub(crate) fn validate(&self, check: &mut Check) {
-        check.range("beams", self.beams as f64, 3.0, 1000.0);
-        check.range("lidar_aspect_ratio", self.lidar_aspect_ratio, 0.1, 100.0);
-    }
-}
 
 /// One beam at the scan's stamp.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -60,12 +16,12 @@ pub(crate) struct Beam {
     pub(crate) range: f32,
 }
 
-/// A scan made ready. Buffers are kept from scan to scan.
+/// A scan as the filter uses it. Buffers are kept from scan to scan.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct ReadyScan {
+pub(crate) struct PreprocessedScan {
     /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp [m], in order.
     pub(crate) points: Vec<[f32; 2]>,
-    /// Where the beams begin.
+    /// Mount of the laser, from where the beams start.
     pub(crate) base_link_from_laser: Pose,
     /// For each end point the index of its beam.
     pub(crate) beam_of: Vec<u32>,
@@ -83,17 +39,20 @@ pub(crate) struct ReadyScan {
     point_of: Vec<u32>,
 }
 
-/// Most beams of a scanner that we believe in: 0.05 deg all around, twice.
+/// A scan of more beams is refused: 0.05 deg all around, twice.
 const MOST_BEAMS: usize = 14_400;
 
-/// Odometry is interpolated for this many stretches of the sweep; in between the motion is as good as straight.
-const STRETCHES: usize = 8;
+/// The sweep is deskewed in this many segments. Within a segment the motion counts as uniform.
+const SEGMENTS: usize = 8;
 
+/// Marks a beam without a return.
 const NO_POINT: u32 = u32::MAX;
 
-impl ReadyScan {
-    /// Makes a scan ready, its beams brought to the stamp by odometry less what `slip` says it errs by. Readings that are not finite, below `range_min` or from `range_max` (or
-    /// `max_range`) on are no returns. A scan may differ in geometry from the one before.
+impl PreprocessedScan {
+    /// Loads a scan. Its beams are transformed to the stamp by odometry, corrected by `slip`.
+    ///
+    /// Readings that are not finite, below `range_min`, or from `range_max` or `max_range` on count as no return. A scan may
+    /// differ in geometry from the one before.
     pub(crate) fn load(
         &mut self,
         scan: &Scan,
@@ -128,12 +87,12 @@ impl ReadyScan {
         self.point_of.clear();
         self.point_of.resize(count, NO_POINT);
         let deskew = parameters.deskew && sweep > 1e-4;
-        let stretch = if deskew { count.div_ceil(STRETCHES) } else { count };
+        let segment = if deskew { count.div_ceil(SEGMENTS) } else { count };
         let (mut begin, mut start) = (0, base_link_from_laser);
         let at_stamp = track.at(scan.stamp, sweep + 0.1).map(|(pose, _)| pose.inverse());
         while begin < count {
-            let end = (begin + stretch).min(count);
-            // The laser's pose at the end of the stretch, seen from base_link at the scan's stamp.
+            let end = (begin + segment).min(count);
+            // The laser's pose at the end of the segment, seen from base_link at the scan's stamp.
             let finish = match at_stamp {
                 Some(from_odom) if deskew => {
                     let seconds = scan.time_increment * end as f64;
@@ -151,11 +110,11 @@ impl ReadyScan {
         if self.points.is_empty() {
             return Err(Dropped::NoBeams);
         }
-        self.weighed(base_link_from_laser);
+        self.load_beams(base_link_from_laser);
         Ok(())
     }
 
-    /// End points of one stretch of beams while the laser moves from `start` to `finish`.
+    /// End points of one segment of beams while the laser moves from `start` to `finish`.
     fn transform(
         &mut self,
         scan: &Scan,
@@ -185,7 +144,7 @@ impl ReadyScan {
                 cos * direction[0] - sin * direction[1],
                 sin * direction[0] + cos * direction[1],
             );
-            // A stretch turns by a few hundredths of a radian: second order is exact to a micrometre.
+            // A segment turns by a few hundredths of a radian: the second order is exact to a micrometre.
             let half = 1.0 - 0.5 * angle * angle;
             let (c, s) = (c * half - s * angle, s * half + c * angle);
             let beam = (beams.start + k) as u32;
@@ -196,8 +155,8 @@ impl ReadyScan {
         }
     }
 
-    /// The beams to weigh, as the laser at the scan's stamp would have measured them.
-    fn weighed(&mut self, base_link_from_laser: Pose) {
+    /// Computes the beams to weigh, as the laser at the scan's stamp would have measured them.
+    fn load_beams(&mut self, base_link_from_laser: Pose) {
         let laser_from_base_link = base_link_from_laser.inverse();
         let (sin, cos) = laser_from_base_link.heading.sin_cos();
         let (sin, cos) = (sin as f32, cos as f32);
@@ -230,7 +189,7 @@ impl ReadyScan {
             .map(|point| self.points[point as usize])
     }
 
-    /// Directions and the choice of beams, anew when the scanner's geometry has changed.
+    /// Computes the directions and the choice of beams again if the scanner's geometry has changed.
     fn choose(&mut self, scan: &Scan, parameters: &BeamParameters) {
         let geometry = (
             scan.ranges.len(),
@@ -245,56 +204,14 @@ impl ReadyScan {
         self.directions.clear();
         self.directions
             .extend((0..scan.ranges.len()).map(|i| [angle(i).cos() as f32, angle(i).sin() as f32]));
-        self.chosen = match parameters.beam_layout {
-            BeamLayout::Uniform => uniform(scan.ranges.len(), parameters.beams),
-            BeamLayout::Boxed => boxed(
-                scan.ranges.len(),
-                scan.angle_min,
-                scan.angle_increment,
-                parameters,
-            ),
-        };
+        self.chosen = chosen_beams(
+            scan.ranges.len(),
+            scan.angle_min,
+            scan.angle_increment,
+            parameters,
+        );
         self.geometry = Some(geometry);
     }
-}
-
-/// `wanted` beams at equal angles, the first and last included.
-fn uniform(count: usize, wanted: usize) -> Vec<u32> {
-    let wanted = wanted.min(count);
-    let last = (count - 1) as f64;
-    let mut chosen: Vec<u32> = (0..wanted)
-        .map(|k| (k as f64 * last / (wanted.max(2) - 1) as f64).round() as u32)
-        .collect();
-    chosen.dedup();
-    chosen
-}
-
-/// `wanted` beams whose ends on the outline of a corridor of the given aspect ratio, with the car in its middle
-/// looking along it, are equally spaced.
-fn boxed(count: usize, angle_min: f64, increment: f64, parameters: &BeamParameters) -> Vec<u32> {
-    let (half_length, half_width) = (parameters.lidar_aspect_ratio, 1.0);
-    let outline = |i: usize| {
-        let (sin, cos) = (angle_min + increment * i as f64).sin_cos();
-        let reach = (half_length / cos.abs().max(1e-9)).min(half_width / sin.abs().max(1e-9));
-        [reach * cos, reach * sin]
-    };
-    let mut path = Vec::with_capacity(count);
-    let (mut length, mut before) = (0.0, outline(0));
-    for i in 0..count {
-        let here = outline(i);
-        length += f64::hypot(here[0] - before[0], here[1] - before[1]);
-        path.push(length);
-        before = here;
-    }
-    let wanted = parameters.beams.min(count);
-    let mut chosen: Vec<u32> = (0..wanted)
-        .map(|k| {
-            let target = length * k as f64 / (wanted.max(2) - 1) as f64;
-            path.partition_point(|&at| at < target).min(count - 1) as u32
-        })
-        .collect();
-    chosen.dedup();
-    chosen
 }
 
 #[cfg(test)]
@@ -337,9 +254,13 @@ mod tests {
         track
     }
 
-    fn load(scan: &Scan, track: &OdometryTrack, parameters: &BeamParameters) -> Result<ReadyScan, Dropped> {
-        let mut ready = ReadyScan::default();
-        ready
+    fn load(
+        scan: &Scan,
+        track: &OdometryTrack,
+        parameters: &BeamParameters,
+    ) -> Result<PreprocessedScan, Dropped> {
+        let mut preprocessed = PreprocessedScan::default();
+        preprocessed
             .load(
                 scan,
                 track,
@@ -348,7 +269,7 @@ mod tests {
                 25.0,
                 parameters,
             )
-            .map(|()| ready)
+            .map(|()| preprocessed)
     }
 
     #[test]
@@ -372,9 +293,14 @@ mod tests {
                 moving.ranges[i] = ((10.0 - laser.x) / direction.cos()) as f32;
             }
         }
-        let ready = load(&moving, &track, &BeamParameters::default()).expect("sound");
-        assert!(ready.points.len() > 400);
-        assert!(ready.points.iter().all(|point| (point[0] - 10.0).abs() < 1e-3));
+        let preprocessed = load(&moving, &track, &BeamParameters::default()).expect("sound");
+        assert!(preprocessed.points.len() > 400);
+        assert!(
+            preprocessed
+                .points
+                .iter()
+                .all(|point| (point[0] - 10.0).abs() < 1e-3)
+        );
         let skewed = load(
             &moving,
             &track,
@@ -383,8 +309,8 @@ mod tests {
                 ..BeamParameters::default()
             },
         );
-        let worst = |ready: &ReadyScan| {
-            ready
+        let worst = |preprocessed: &PreprocessedScan| {
+            preprocessed
                 .points
                 .iter()
                 .map(|p| (p[0] - 10.0).abs())
@@ -394,36 +320,19 @@ mod tests {
     }
 
     #[test]
-    fn boxed_beams_look_ahead_and_back() {
-        let parameters = BeamParameters::default();
-        let chosen = boxed(COUNT, -0.75 * PI, 1.5 * PI / (COUNT - 1) as f64, &parameters);
-        assert!((19..=21).contains(&chosen.len()));
-        let ahead = |limit: f64| {
-            let angle = |i: u32| -0.75 * PI + 1.5 * PI / (COUNT - 1) as f64 * f64::from(i);
-            chosen.iter().filter(|&&i| angle(i).abs() < limit).count()
-        };
-        let evenly = 21.0 * 2.0 * 0.6 / (1.5 * PI);
-        assert!(
-            ahead(0.6) as f64 > 1.5 * evenly,
-            "{} beams within 0.6 rad",
-            ahead(0.6)
-        );
-    }
-
-    #[test]
     fn what_is_no_reading_is_no_return() {
         let mut ranges = vec![5.0; COUNT];
         ranges[..5].copy_from_slice(&[f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -1.0, 65.533]);
         ranges[5] = 0.01;
-        let ready = load(
+        let preprocessed = load(
             &scan(ranges),
             &OdometryTrack::default(),
             &BeamParameters::default(),
         )
         .expect("sound");
-        assert_eq!(ready.points.len(), COUNT - 6);
-        assert!((ready.no_return - 6.0 / COUNT as f64).abs() < 1e-12);
-        assert!(ready.beams[0].range.is_infinite());
+        assert_eq!(preprocessed.points.len(), COUNT - 6);
+        assert!((preprocessed.no_return - 6.0 / COUNT as f64).abs() < 1e-12);
+        assert!(preprocessed.beams[0].range.is_infinite());
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
 use protocol::{CommandId, EventKind, Rates, SetRef};
-use synpf::{Hypothesis, Mode, Odometry, Scan, Stamp, SynPf, Tuning, Update, WeightedPose};
+use synpf::{Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, SynPf, Tuning, Update, WeightedPose};
 
 use crate::bag::SensorEvent;
 use crate::clock::SensorClock;

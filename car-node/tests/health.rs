@@ -12,7 +12,7 @@ use car_node::health::State;
 use car_node::source::{Belief, Feed, Next, Race, Source};
 use maps::{Cell, OccupancyGrid, Pose};
 use simulator::{CarSetup, Guidance, Surface, Track, Wall, Walls};
-use synpf::{Parameters, SynPf, TrackMap};
+use synpf::{Localizer, Parameters, SynPf, TrackMap};
 
 fn club() -> Track {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");

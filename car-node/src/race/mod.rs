@@ -15,7 +15,7 @@ use maps::{Pose, wrap_angle};
 use serde::{Deserialize, Serialize};
 use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
 
-use synpf::{Odometry, Parameters, Scan, SetUpError, Stamp, SynPf, TrackMap, Twist, YawRate};
+use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, SynPf, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, Mishap, MishapKind, RaceSummary};

@@ -175,7 +175,7 @@ fn map_building(criterion: &mut Criterion) {
     group.bench_function("look for the scan on the whole map", |bencher| {
         bencher.iter_batched_ref(
             || drive.localizer.clone(),
-            |localizer| localizer.run_stage(Stage::Look, scan),
+            |localizer| localizer.run_stage(Stage::Search, scan),
             BatchSize::SmallInput,
         );
     });

@@ -5,14 +5,19 @@
 //! same log give the same bytes.
 mod beam_layout;
 mod beam_model;
+mod calibration;
 mod cddt;
 mod defects;
+mod error;
+mod estimate;
 mod likelihood_field;
+mod loss_detector;
 mod motion_model;
 mod normal_pool;
 mod odometry_track;
 mod parameters;
 mod particle_estimate;
+mod particle_filter;
 mod particles;
 mod pose_array;
 mod pose_bins;
@@ -21,32 +26,34 @@ mod quality;
 mod range_table;
 mod ranges;
 mod recovery;
-mod refine;
 mod resampling;
+mod scan_matcher;
 mod search;
 mod seed;
 mod sensor_model;
-mod slip;
-mod slip_model;
 mod surprise;
 mod synpf;
 mod track_map;
-mod walls;
+mod tracker;
+mod tuning;
+mod validation;
 
 pub use beam_layout::{BeamLayout, BeamParameters};
 pub use defects::Defects;
+pub use error::SetUpError;
 pub use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
     ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose, YawRate,
 };
+pub use loss_detector::RecoveryParameters;
 pub use motion_model::{MotionModel, MotionParameters};
 pub use parameters::Parameters;
 pub use particles::ParticleParameters;
-pub use recovery::RecoveryParameters;
-pub use refine::RefinementParameters;
+pub use scan_matcher::RefinementParameters;
 pub use search::SearchParameters;
 pub use sensor_model::{RangeMethod, SensorModelKind, SensorParameters};
 #[doc(hidden)]
 pub use synpf::Stage;
-pub use synpf::{SetUpError, SynPf, Tuning};
+pub use synpf::SynPf;
 pub use track_map::TrackMap;
+pub use tuning::Tuning;

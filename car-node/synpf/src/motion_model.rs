@@ -7,7 +7,7 @@ use maps::Pose;
 use serde::{Deserialize, Serialize};
 
 use crate::defects::Defects;
-use crate::parameters::Check;
+use crate::validation::Check;
 
 /// Which motion model moves the particles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
+use localizer::{Dropped, Odometry, Stamp, Twist, YawRate};
 use maps::Pose;
 
-use crate::slip_model::{Drive, SlipModel};
-use crate::{Dropped, Odometry, Stamp, Twist, YawRate};
+use crate::calibration::{Drive, SlipModel};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
 /// whoever reads it sees one smooth motion in a frame of its own. Whether a jump was one of the car, which was carried or
@@ -14,16 +14,19 @@ use crate::{Dropped, Odometry, Stamp, Twist, YawRate};
 pub(crate) struct OdometryTrack {
     /// Poses in the smooth frame.
     points: VecDeque<Odometry>,
-    /// The last message as it came.
-    last: Option<Odometry>,
+    /// The same messages as they were received.
+    received: VecDeque<Odometry>,
     yaw_rates: VecDeque<YawRate>,
     /// The wheels' speed as it came [m/s], over the last [`ACCELERATING`].
     speeds: VecDeque<(Stamp, f64)>,
     /// What the car was doing at the last message.
     drive: Drive,
     /// What would bring the poses that follow the last jumps, in the smooth frame, to where they are if the car jumped.
-    leap: Option<Pose>,
+    discontinuity: Option<Pose>,
 }
+
+/// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.
+pub(crate) const CARRY: f64 = 0.25;
 
 /// As much as a late scan can need: 2 s at 200 Hz.
 const KEPT: usize = 400;
@@ -43,6 +46,39 @@ const GYRO_SILENT: f64 = 0.1;
 const ACCELERATING: f64 = 0.08;
 
 impl OdometryTrack {
+    /// The track that these messages lead to, whatever slip was taken out of another one. Messages that are refused are left
+    /// out; discontinuities among them lie in the past and are forgotten.
+    pub(crate) fn replayed(
+        odometry: &[Odometry],
+        yaw_rates: &[YawRate],
+        use_imu: bool,
+        slip: &SlipModel,
+    ) -> Self {
+        let mut track = Self::default();
+        let mut gyro = yaw_rates.iter().peekable();
+        for message in odometry {
+            while let Some(reading) = gyro.next_if(|reading| reading.stamp <= message.stamp) {
+                track.push_yaw_rate(reading).ok();
+            }
+            track.push(message, use_imu, slip).ok();
+        }
+        for reading in gyro {
+            track.push_yaw_rate(reading).ok();
+        }
+        track.discontinuity = None;
+        track
+    }
+
+    /// Recent odometry as it was received, oldest first.
+    pub(crate) fn received(&self) -> impl Iterator<Item = &Odometry> {
+        self.received.iter()
+    }
+
+    /// Recent yaw rates, oldest first.
+    pub(crate) fn yaw_rates(&self) -> impl Iterator<Item = &YawRate> {
+        self.yaw_rates.iter()
+    }
+
     pub(crate) fn push(
         &mut self,
         odometry: &Odometry,
@@ -65,8 +101,8 @@ impl OdometryTrack {
         if !sound {
             return Err(Dropped::Malformed);
         }
-        let Some(last) = self.last else {
-            self.last = Some(*odometry);
+        let Some(&last) = self.received.back() else {
+            self.received.push_back(*odometry);
             self.points.push_back(*odometry);
             return Ok(());
         };
@@ -85,8 +121,8 @@ impl OdometryTrack {
         let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + possible[0];
         let before = self.points.back().expect("a last message has a point").pose;
         if (off[0] > possible[0] || off[1] > possible[1]) && !gone_on {
-            let leap = before * step * (before * expected).inverse();
-            self.leap = Some(self.leap.map_or(leap, |earlier| earlier * leap));
+            let jump = before * step * (before * expected).inverse();
+            self.discontinuity = Some(self.discontinuity.map_or(jump, |earlier| earlier * jump));
             step = expected;
         }
         let mut arc = step.log();
@@ -107,7 +143,7 @@ impl OdometryTrack {
             ],
             self.drive,
         );
-        self.last = Some(*odometry);
+        self.received.push_back(*odometry);
         self.points.push_back(Odometry {
             pose: before * step,
             twist: Twist {
@@ -119,6 +155,7 @@ impl OdometryTrack {
         });
         if self.points.len() > KEPT {
             self.points.pop_front();
+            self.received.pop_front();
         }
         Ok(())
     }
@@ -143,8 +180,8 @@ impl OdometryTrack {
 
     /// The jumps since this was last asked, as a motion of the smooth frame: with it in front, later poses are where they
     /// would be if the car itself had jumped. None when there was none.
-    pub(crate) fn take_leap(&mut self) -> Option<Pose> {
-        self.leap.take()
+    pub(crate) fn take_discontinuity(&mut self) -> Option<Pose> {
+        self.discontinuity.take()
     }
 
     /// What the car was doing at the last message.
@@ -286,11 +323,11 @@ mod tests {
             message.pose.x += 7.0;
         }
         let mut track = track(messages);
-        let leap = track.take_leap().expect("a jump");
+        let jump = track.take_discontinuity().expect("a jump");
         let (pose, _) = track.at(Stamp(9 * 20_000_000), 0.0).expect("covered");
         assert!(pose.distance(circle(9).pose) < 1e-2);
-        assert!((leap * pose).distance(Pose::new(7.0, 0.0, 0.0) * circle(9).pose) < 1e-2);
-        assert_eq!(track.take_leap(), None, "asked once");
+        assert!((jump * pose).distance(Pose::new(7.0, 0.0, 0.0) * circle(9).pose) < 1e-2);
+        assert_eq!(track.take_discontinuity(), None, "asked once");
     }
 
     #[test]

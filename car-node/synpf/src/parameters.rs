@@ -15,12 +15,13 @@ use localizer::ParameterFault;
 
 use crate::beam_layout::BeamParameters;
 use crate::defects::Defects;
+use crate::loss_detector::RecoveryParameters;
 use crate::motion_model::MotionParameters;
 use crate::particles::ParticleParameters;
-use crate::recovery::RecoveryParameters;
-use crate::refine::RefinementParameters;
+use crate::scan_matcher::RefinementParameters;
 use crate::search::SearchParameters;
 use crate::sensor_model::SensorParameters;
+use crate::validation::Check;
 
 /// Everything that can be tuned.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -142,7 +143,7 @@ impl Parameters {
 
     /// Every value that is out of its range, or contradicts another.
     pub fn validate(&self) -> Result<(), Vec<ParameterFault>> {
-        let mut check = Check(Vec::new());
+        let mut check = Check::default();
         self.particles.validate(&mut check);
         self.beams.validate(&mut check);
         self.sensor.validate(&mut check);
@@ -156,28 +157,6 @@ impl Parameters {
 
 fn from_values(values: BTreeMap<String, Value>) -> serde_json::Result<Parameters> {
     serde_json::from_value(Value::Object(values.into_iter().collect()))
-}
-
-/// Collects faults, so that a set is refused whole with all of them.
-pub(crate) struct Check(Vec<ParameterFault>);
-
-impl Check {
-    /// `value` must be a number in `[low, high]`.
-    pub(crate) fn range(&mut self, key: &str, value: f64, low: f64, high: f64) {
-        self.that(key, (low..=high).contains(&value), || {
-            format!("{value} is not in [{low}, {high}]")
-        });
-    }
-
-    /// `condition` must hold; else `fault` says what does not.
-    pub(crate) fn that(&mut self, key: &str, condition: bool, fault: impl FnOnce() -> String) {
-        if !condition {
-            self.0.push(ParameterFault {
-                key: key.into(),
-                fault: fault(),
-            });
-        }
-    }
 }
 
 #[cfg(test)]

@@ -10,9 +10,9 @@ use wide::f32x8;
 
 use crate::motion_model::Motion;
 use crate::normal_pool::{NormalPool, POOL};
-use crate::parameters::Check;
 use crate::pose_array::{PoseArray, load, store};
 use crate::pose_bins::PoseBins;
+use crate::validation::Check;
 
 /// How many particles there are, and when they are resampled.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,8 +3,8 @@
 use maps::Pose;
 
 use crate::beam_layout::{BeamParameters, chosen_beams};
+use crate::calibration::Slip;
 use crate::odometry_track::OdometryTrack;
-use crate::slip::Slip;
 use crate::{Dropped, Scan};
 
 /// One beam at the scan's stamp.
@@ -247,7 +247,7 @@ mod tests {
                         twist,
                     },
                     false,
-                    &crate::slip_model::SlipModel::default(),
+                    &crate::calibration::SlipModel::default(),
                 )
                 .expect("sound");
         }

@@ -2,8 +2,8 @@
 
 use maps::Pose;
 
-use crate::TrackMap;
 use crate::preprocessed_scan::PreprocessedScan;
+use crate::track_map::TrackMap;
 
 /// The fit of one scan at one pose.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -9,13 +9,14 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::TrackMap;
-use crate::parameters::{Check, Parameters};
+use crate::calibration::WallCalibration;
+use crate::estimate::Estimate;
 use crate::preprocessed_scan::PreprocessedScan;
-use crate::refine::{Estimate, RefinementParameters, fit_by, refine};
+use crate::scan_matcher::{RefinementParameters, fit_by, refine};
 use crate::seed::seed;
 use crate::surprise::Fall;
-use crate::walls::Walls;
+use crate::track_map::TrackMap;
+use crate::validation::Check;
 
 /// Parameters of the search.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -53,6 +54,13 @@ impl SearchParameters {
         check.range("search_margin", self.search_margin, 0.0, 1000.0);
         check.range("search_distance", self.search_distance, 0.0, 100.0);
     }
+}
+
+/// The parts of a parameter set that a search goes by.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SearchSettings {
+    pub(crate) search: SearchParameters,
+    pub(crate) refinement: RefinementParameters,
 }
 
 /// A pose that the car may be at.
@@ -93,6 +101,9 @@ pub(crate) struct Search {
     since_seeding: f64,
 }
 
+/// Standard deviation of a candidate that motion has not confirmed [m], [m], [rad]: it may be another place.
+const UNCONFIRMED: [f64; 3] = [1.0, 1.0, 0.5];
+
 /// How long one scan is remembered in a score [s].
 const MEMORY: f64 = 0.5;
 
@@ -122,7 +133,7 @@ impl Search {
         scan: &PreprocessedScan,
         motion: Pose,
         seconds: f64,
-        parameters: &Parameters,
+        parameters: &SearchSettings,
     ) -> Option<Estimate> {
         self.driven += motion.x.hypot(motion.y);
         self.since_seeding += seconds;
@@ -139,7 +150,7 @@ impl Search {
                 &scan.points,
                 prior.pose,
                 &prior,
-                Walls::default(),
+                WallCalibration::default(),
                 &parameters.refinement,
             );
             let score = score(map, scan, candidate.estimate.pose);
@@ -178,7 +189,31 @@ impl Search {
         self.candidates = kept;
     }
 
-    fn confirmed(&self, parameters: &Parameters) -> Option<Estimate> {
+    /// The best candidate, with a covariance as large as the doubt: how far the others are spread about it by their
+    /// likelihood, and never less than [`UNCONFIRMED`].
+    pub(crate) fn best_so_far(&self) -> Option<Estimate> {
+        let best = self.candidates.first()?;
+        let floor = UNCONFIRMED.map(|sigma| sigma * sigma);
+        let mut spread = Matrix3::zeros();
+        let mut mass = 0.0;
+        for candidate in &self.candidates {
+            let weight = (candidate.merit() - best.merit()).exp();
+            let (here, there) = (best.estimate.pose, candidate.estimate.pose);
+            let off = Vector3::new(
+                there.x - here.x,
+                there.y - here.y,
+                wrap_angle(there.heading - here.heading),
+            );
+            spread += (candidate.estimate.covariance + off * off.transpose()) * weight;
+            mass += weight;
+        }
+        Some(Estimate {
+            pose: best.estimate.pose,
+            covariance: spread / mass + Matrix3::from_diagonal(&Vector3::from(floor)),
+        })
+    }
+
+    fn confirmed(&self, parameters: &SearchSettings) -> Option<Estimate> {
         let best = self.candidates.first()?;
         let margin = self
             .candidates
@@ -200,7 +235,7 @@ impl Search {
         map: &TrackMap,
         scan: &PreprocessedScan,
         [stayed, moved]: [Pose; 2],
-        parameters: &Parameters,
+        parameters: &SearchSettings,
     ) -> Option<Self> {
         // So little is the filter's to mend.
         if stayed.distance(moved) < 0.1 * f64::from(NEARBY) && same_way(stayed, moved) {
@@ -247,7 +282,7 @@ impl Search {
         pose: Pose,
         sudden: bool,
         fall: Option<Fall>,
-        parameters: &Parameters,
+        parameters: &SearchSettings,
     ) -> Option<Self> {
         let mut search = Self {
             candidates: candidates(map, scan, parameters),
@@ -333,7 +368,7 @@ pub(crate) fn fit_of(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> f64
 }
 
 /// Candidates from one scan alone.
-fn candidates(map: &TrackMap, scan: &PreprocessedScan, parameters: &Parameters) -> Vec<Candidate> {
+fn candidates(map: &TrackMap, scan: &PreprocessedScan, parameters: &SearchSettings) -> Vec<Candidate> {
     seed(map, &scan.points, &parameters.search)
         .into_par_iter()
         .map(|pose| Candidate::new(map, scan, fitted(map, scan, pose, parameters)))
@@ -341,7 +376,7 @@ fn candidates(map: &TrackMap, scan: &PreprocessedScan, parameters: &Parameters) 
 }
 
 /// The fit of part of a scan near a pose that is known only coarsely.
-fn fitted(map: &TrackMap, scan: &PreprocessedScan, pose: Pose, parameters: &Parameters) -> Estimate {
+fn fitted(map: &TrackMap, scan: &PreprocessedScan, pose: Pose, parameters: &SearchSettings) -> Estimate {
     let prior = Estimate {
         pose,
         covariance: Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01)),
@@ -355,7 +390,7 @@ fn fitted(map: &TrackMap, scan: &PreprocessedScan, pose: Pose, parameters: &Para
         &scan.points,
         pose,
         &prior,
-        Walls::default(),
+        WallCalibration::default(),
         &parameters,
     )
 }
@@ -400,7 +435,7 @@ mod tests {
             {
                 *point = point.map(|v| 0.6 * v);
             }
-            Search::second_opinion(&map, &scan, wrong, true, None, &Parameters::default())
+            Search::second_opinion(&map, &scan, wrong, true, None, &SearchSettings::default())
         };
         let search = opinion(0).expect("a better place");
         assert!(same(search.candidates[0].estimate.pose, truth), "{search:?}");

@@ -11,11 +11,12 @@ use crate::TrackMap;
 use crate::beam_model::BeamModel;
 use crate::defects::Defects;
 use crate::likelihood_field::LikelihoodField;
-use crate::parameters::{Check, Parameters};
+use crate::parameters::Parameters;
 use crate::particles::Particles;
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::range_table::{DIRECTIONS, TableParameters};
 use crate::ranges::Ranges;
+use crate::validation::Check;
 
 /// Which sensor model weighs the particles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

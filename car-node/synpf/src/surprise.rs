@@ -8,7 +8,7 @@
 //! length (in `hall` other places fit the right pose's scans better for seconds). Nor does it on a map that fits badly, whose
 //! fit varies from place to place.
 
-use crate::recovery::RecoveryParameters;
+use crate::loss_detector::RecoveryParameters;
 
 /// Follows the fit of scans at the estimate.
 #[derive(Debug, Clone, Default)]

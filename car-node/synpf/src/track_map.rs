@@ -6,10 +6,9 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
+use crate::error::SetUpError;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::seed::Blurred;
-use crate::sensor_model::RangeMethod;
-use crate::{Parameters, SetUpError};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,
 /// which are built for the regions that a car is in and shared between threads and localizers.
@@ -47,7 +46,7 @@ const SMALLEST_REGION: f64 = 1.0;
 const TRACK_CLEARANCE: f64 = 5.0;
 
 impl TrackMap {
-    /// Builds the distance field and finds the regions. Range tables follow with [`TrackMap::prepare`], or when a
+    /// Builds the distance field and finds the regions. Range tables follow with `TrackMap::prepare`, or when a
     /// localizer first needs them. Fails on a map without room for a car.
     pub fn new(grid: OccupancyGrid) -> Result<Self, SetUpError> {
         let field = DistanceField::new(&grid);
@@ -98,25 +97,6 @@ impl TrackMap {
             .field
             .trace(start, [cos as f32, sin as f32], (max_range / resolution) as f32);
         (f64::from(cells) * resolution).min(max_range)
-    }
-
-    /// Builds the range tables that a set needs, if they are not there yet, so that the first update does not have
-    /// to: for the region around a pose in `map`, or, without one, for all that look like tracks.
-    pub fn prepare(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) {
-        match parameters.sensor.range_method {
-            RangeMethod::Lut => {
-                let at = map_from_base_link.map(|pose| self.region_at(self.grid_from_map * pose));
-                let regions =
-                    at.map_or_else(|| self.plausible_regions(), |region| region.into_iter().collect());
-                for region in regions {
-                    self.table(region, parameters.sensor.table_parameters(parameters.defects));
-                }
-            }
-            RangeMethod::Cddt => {
-                self.cddt();
-            }
-            RangeMethod::RayMarching => {}
-        }
     }
 
     /// Memory that the range tables (and the CDDT, where a set uses it) take [bytes].

@@ -6,7 +6,7 @@
 use crate::Parameters;
 use crate::defects::Defects;
 use crate::motion_model::{MotionModel, MotionParameters};
-use crate::refine::RefinementParameters;
+use crate::scan_matcher::RefinementParameters;
 
 /// A set by name; see [`Parameters::NAMES`].
 pub(super) fn named(name: &str) -> Option<Parameters> {

@@ -1,93 +1,101 @@
-//! The stages of an update one by one, for the benchmarks: what each costs on a localizer in mid-drive.
+//! The steps of an update one by one, for the benchmarks: what each costs on a localizer in mid-drive.
 
+use localizer::Scan;
 use maps::Pose;
 
 use super::SynPf;
-use crate::Scan;
 use crate::motion_model::Motion;
 use crate::particle_estimate::ParticleEstimate;
-use crate::quality::Quality;
+use crate::particle_filter::Weighted;
 use crate::seed::seed;
+use crate::tracker::fit_scan;
 
-/// A part of [`SynPf::on_scan`].
+/// A step of [`SynPf::on_scan`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
     /// The scan checked, deskewed and its beams chosen.
-    Deskew,
+    Preprocess,
     /// The particles moved on by odometry, with noise.
-    Move,
-    /// The log-likelihood of the scan at every particle.
-    Weigh,
-    /// Weights from log-weights, mean and covariance of the particles.
-    Belief,
+    Predict,
+    /// The log-likelihood of the scan at every particle, the weights, and the particles summed up.
+    Reweight,
     /// The whole scan fitted around the prediction.
-    Refine,
+    Fit,
     /// Alignment, residual, short and long beams at the estimate.
-    Judge,
+    Assess,
     /// Systematic resampling of all particles.
     Resample,
     /// A look at the whole map for where the scan may have been taken; part of a search, not of an update.
-    Look,
+    Search,
 }
 
 impl Stage {
     /// Those of an update, in its order.
-    pub const ALL: [Self; 7] = [
-        Self::Deskew,
-        Self::Move,
-        Self::Weigh,
-        Self::Belief,
-        Self::Refine,
-        Self::Judge,
+    pub const ALL: [Self; 6] = [
+        Self::Preprocess,
+        Self::Predict,
+        Self::Reweight,
+        Self::Fit,
+        Self::Assess,
         Self::Resample,
     ];
 }
 
 impl SynPf {
-    /// Runs one stage on the state that the last update left. What it does to that state is no update: throw the
+    /// Runs one step on the state that the last update left. What it does to that state is no update: throw the
     /// localizer away.
     pub fn run_stage(&mut self, stage: Stage, scan: &Scan) {
+        let parameters = &self.parameters;
+        let estimate = &self.tracker.estimate;
         match stage {
-            Stage::Deskew => {
+            Stage::Preprocess => {
                 let loaded = self.scan.load(
                     scan,
-                    &self.track,
-                    self.slip,
+                    &self.odometry,
+                    self.calibration.slip,
                     self.base_link_from_laser,
-                    self.parameters.sensor.max_range,
-                    &self.parameters.beams,
+                    parameters.sensor.max_range,
+                    &parameters.beams,
                 );
                 debug_assert!(loaded.is_ok(), "{loaded:?}");
             }
-            Stage::Move => self.particles.advance(&Motion::new(
+            Stage::Predict => self.filter.predict(&Motion::new(
                 Pose::new(0.1, 0.0, 0.01),
                 0.025,
                 1.0,
-                &self.parameters.motion,
-                self.parameters.defects,
+                &parameters.motion,
+                parameters.defects,
             )),
-            Stage::Weigh => self.weigh(self.estimate.pose),
-            Stage::Belief => {
-                self.particles.normalize();
-                std::hint::black_box(self.particles.estimate());
+            Stage::Reweight => {
+                let near = estimate.pose;
+                std::hint::black_box(self.filter.reweight(&self.map, &self.scan, near, parameters));
             }
-            Stage::Refine => {
-                let belief = ParticleEstimate {
-                    mean: self.estimate.pose,
-                    covariance: self.estimate.covariance,
-                    ess_ratio: 1.0,
+            Stage::Fit => {
+                let weighted = Weighted {
+                    particles: ParticleEstimate {
+                        mean: estimate.pose,
+                        covariance: estimate.covariance,
+                        ess_ratio: 1.0,
+                    },
+                    sound: true,
                 };
-                std::hint::black_box(self.refined(&self.estimate, &belief));
+                std::hint::black_box(fit_scan(
+                    self.map.field(),
+                    &self.scan.points,
+                    estimate,
+                    &weighted,
+                    self.calibration.walls,
+                    &parameters.refinement,
+                ));
             }
-            Stage::Judge => {
-                std::hint::black_box(Quality::new(&self.map, &self.scan, self.estimate.pose));
-            }
-            Stage::Look => {
-                std::hint::black_box(seed(&self.map, &self.scan.points, &self.parameters.search));
+            Stage::Assess => {
+                std::hint::black_box(self.assess());
             }
             Stage::Resample => {
-                let count = self.particles.len();
-                self.particles.resample(count);
+                self.filter.resample(0.0, estimate, 1.0, parameters);
+            }
+            Stage::Search => {
+                std::hint::black_box(seed(&self.map, &self.scan.points, &parameters.search));
             }
         }
     }

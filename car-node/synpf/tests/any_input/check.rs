@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use arbitrary::{Arbitrary, Unstructured};
 use maps::{Cell, OccupancyGrid, Pose};
-use synpf::{Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist, YawRate};
+use synpf::{Localizer, Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist, YawRate};
 
 /// What can happen to a localizer. Floats come with all their bits: NaN, infinities, subnormals.
 #[derive(Debug, Arbitrary)]

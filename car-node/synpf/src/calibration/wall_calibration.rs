@@ -7,11 +7,9 @@
 
 use maps::{DistanceField, Pose};
 
-use crate::refine::RefinementParameters;
-
 /// The walls as a laser sees them, learned while driving.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct Walls {
+pub(crate) struct WallCalibration {
     /// How much nearer they stand than the map has them [m].
     pub(crate) offset: f64,
     /// Standard deviation of the end points about them [m]; 0 before anything was seen.
@@ -27,7 +25,7 @@ const FEWEST: usize = 20;
 /// End points that are looked at.
 const MOST: usize = 180;
 
-impl Walls {
+impl WallCalibration {
     /// The walls by one scan at a pose; None where hardly a point lies at a wall. The offset is the robust mean of the signed
     /// distances, the scatter their median absolute deviation (Huber, Robust Statistics, 1981, section 5.1) about what is
     /// `known`, as a standard deviation.
@@ -67,12 +65,12 @@ impl Walls {
     }
 
     /// Takes in what one scan showed, after so much driving [m]: a car that stands sees the same again.
-    pub(crate) fn learn(&mut self, seen: Self, driven: f64, parameters: &RefinementParameters) {
+    pub(crate) fn learn(&mut self, seen: Self, driven: f64, distance: f64) {
         /// More is not a map's grain [m].
         const MOST_OFFSET: f64 = 0.05;
         /// More is a wrong pose [m].
         const MOST_SCATTER: f64 = 0.1;
-        let gain = 1.0 - (-driven.abs() / parameters.wall_offset_distance).exp();
+        let gain = 1.0 - (-driven.abs() / distance).exp();
         self.offset = (self.offset + gain * (seen.offset - self.offset)).clamp(-MOST_OFFSET, MOST_OFFSET);
         self.scatter = (self.scatter + gain * (seen.scatter - self.scatter)).min(MOST_SCATTER);
     }
@@ -112,25 +110,30 @@ mod tests {
     #[test]
     fn offset_and_scatter_are_learned_while_driving() {
         let (field, pose) = (wall(), Pose::new(10.0, 1.0, 0.0));
-        let parameters = RefinementParameters::default();
-        let mut walls = Walls::default();
+        let mut walls = WallCalibration::default();
         let scan = hits(0.02, 0.05);
         for driven in [0.0, 0.1].map(|step| [step; 200]).concat() {
-            let seen = Walls::seen(&field, &scan, pose, walls).expect("a wall in view");
-            walls.learn(seen, driven, &parameters);
+            let seen = WallCalibration::seen(&field, &scan, pose, walls).expect("a wall in view");
+            walls.learn(seen, driven, 3.0);
         }
         assert!((walls.offset - 0.02).abs() < 0.01, "{walls:?}");
         assert!((walls.scatter - 0.05).abs() < 0.01, "{walls:?}");
-        let mut standing = Walls::default();
-        standing.learn(walls, 0.0, &parameters);
-        assert_eq!(standing, Walls::default());
+        let mut standing = WallCalibration::default();
+        standing.learn(walls, 0.0, 3.0);
+        assert_eq!(standing, WallCalibration::default());
     }
 
     #[test]
     fn without_walls_nothing_is_seen() {
         let field = wall();
-        let nothing =
-            |points: &[[f32; 2]]| Walls::seen(&field, points, Pose::new(10.0, 1.0, 0.0), Walls::default());
+        let nothing = |points: &[[f32; 2]]| {
+            WallCalibration::seen(
+                &field,
+                points,
+                Pose::new(10.0, 1.0, 0.0),
+                WallCalibration::default(),
+            )
+        };
         assert_eq!(nothing(&[]), None);
         assert_eq!(nothing(&[[1.0, 0.1]; 100]), None, "in the open");
         assert_eq!(nothing(&[[1e9, f32::NAN]; 100]), None, "off the map");

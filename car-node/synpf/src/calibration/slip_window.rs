@@ -2,9 +2,8 @@
 
 use std::collections::VecDeque;
 
+use localizer::Stamp;
 use maps::Pose;
-
-use crate::Stamp;
 
 /// Compares odometry with the posterior over a sliding window.
 #[derive(Debug, Clone, Default)]
@@ -17,7 +16,7 @@ struct Step {
     stamp: Stamp,
     seconds: f64,
     /// By the wheels as they turned [m].
-    wheels: f64,
+    wheel_distance: f64,
     /// The same, less the slip that was expected [m], and the turn [rad].
     odometry: [f64; 2],
     posterior: [f64; 2],
@@ -66,11 +65,18 @@ const WALKING: f64 = 1.0;
 impl SlipWindow {
     /// Adds one scan's motion: by the wheels [m], by odometry less the slip expected, and by the posterior, each in the
     /// frame of its own start.
-    pub(crate) fn push(&mut self, stamp: Stamp, seconds: f64, wheels: f64, odometry: Pose, posterior: Pose) {
+    pub(crate) fn push(
+        &mut self,
+        stamp: Stamp,
+        seconds: f64,
+        wheel_distance: f64,
+        odometry: Pose,
+        posterior: Pose,
+    ) {
         self.steps.push_back(Step {
             stamp,
             seconds,
-            wheels,
+            wheel_distance,
             odometry: [odometry.x, odometry.heading],
             posterior: [posterior.x, posterior.heading],
         });
@@ -91,7 +97,7 @@ impl SlipWindow {
             return Slip::default();
         }
         let posterior = sum(|step| step.posterior[0]);
-        let driven = sum(|step| step.wheels);
+        let driven = sum(|step| step.wheel_distance);
         let share = |odometry: f64| {
             if driven.abs() < WALKING * seconds {
                 0.0
@@ -134,10 +140,10 @@ impl SlipWindow {
 mod tests {
     use super::*;
 
-    fn slip(wheels: f64, odometry: Pose, posterior: Pose) -> Slip {
+    fn slip(wheel_distance: f64, odometry: Pose, posterior: Pose) -> Slip {
         let mut window = SlipWindow::default();
         for i in 0..20 {
-            window.push(Stamp(i * 25_000_000), 0.025, wheels, odometry, posterior);
+            window.push(Stamp(i * 25_000_000), 0.025, wheel_distance, odometry, posterior);
         }
         window.slip()
     }

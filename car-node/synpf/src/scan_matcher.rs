@@ -9,8 +9,9 @@ use maps::{DistanceField, Pose};
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::parameters::Check;
-use crate::walls::Walls;
+use crate::calibration::WallCalibration;
+use crate::estimate::Estimate;
+use crate::validation::Check;
 
 /// Parameters of the refinement.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -64,15 +65,6 @@ impl RefinementParameters {
     }
 }
 
-/// A pose with its uncertainty, in the grid's frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Estimate {
-    /// The pose of `base_link`.
-    pub(crate) pose: Pose,
-    /// Covariance of x, y [m^2] and heading [rad^2].
-    pub(crate) covariance: Matrix3<f64>,
-}
-
 /// The sums of one Gauss-Newton step.
 struct Normal {
     information: Matrix3<f64>,
@@ -85,7 +77,7 @@ pub(crate) fn refine(
     points: &[[f32; 2]],
     start: Pose,
     prior: &Estimate,
-    walls: Walls,
+    walls: WallCalibration,
     parameters: &RefinementParameters,
 ) -> Estimate {
     let stride = points.len().div_ceil(parameters.refine_beams).max(1);
@@ -223,19 +215,6 @@ pub(crate) fn fit_by(
     f64::from(sum) / f64::from(count.max(1))
 }
 
-impl Estimate {
-    /// The estimate carried on by a motion of `base_link`, whose uncertainty in its own frame is `noise`.
-    pub(crate) fn moved(&self, motion: Pose, noise: &Matrix3<f64>) -> Self {
-        let pose = self.pose * motion;
-        let (dx, dy) = (pose.x - self.pose.x, pose.y - self.pose.y);
-        let jacobian = Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0);
-        let (sin, cos) = self.pose.heading.sin_cos();
-        let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
-        let covariance = jacobian * self.covariance * jacobian.transpose() + turn * noise * turn.transpose();
-        Self { pose, covariance }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -283,7 +262,7 @@ mod tests {
             points,
             start,
             &prior,
-            Walls::default(),
+            WallCalibration::default(),
             &RefinementParameters::default(),
         )
     }

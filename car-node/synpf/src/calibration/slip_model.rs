@@ -8,7 +8,7 @@
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::refine::Estimate;
+use crate::estimate::Estimate;
 
 /// What slip depends on at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

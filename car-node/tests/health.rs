@@ -64,7 +64,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
             }
             Feed::Truth(truth) => log.truth.push((truth.stamp, truth.pose)),
             Feed::Word(word) => panic!("{word}"),
-            Feed::Placed(_) => panic!("the marshals had to come"),
+            Feed::Placed(_) => panic!("the recovery crew had to come"),
         }
     }
     log

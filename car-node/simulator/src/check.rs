@@ -1,14 +1,14 @@
-//! Whether a track can be raced on, and what it is like.
+//! The report on a track: its measures, and the faults that make it unfit for racing.
 
 use maps::{Cell, OccupancyGrid};
 use serde::Serialize;
 
 use crate::{Track, VehicleParams};
 
-/// Least distance from the raceline to a wall: half a car and a hand's breadth [m].
+/// Least distance from the raceline to a wall [m]: half a car and 6 cm.
 const CLEARANCE: f64 = 0.20;
 
-/// What a track is like.
+/// A track's measures and faults.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackReport {
     /// Its name.
@@ -33,15 +33,15 @@ pub struct TrackReport {
     pub resolution_m: f64,
     /// Free area of the map [m^2].
     pub free_m2: f64,
-    /// How far the map's walls are from the true ones, seen from the raceline: mean (positive when the map's are further
-    /// away) and standard deviation [m].
+    /// Error of the map's walls, seen from the raceline [m]: mean (positive where the map's walls are further away) and
+    /// standard deviation.
     pub map_error_m: [f64; 2],
-    /// Why it cannot be raced on; empty if it can.
+    /// Faults that make it unfit for racing; empty if there are none.
     pub faults: Vec<String>,
 }
 
 impl TrackReport {
-    /// Looks at a track from all points of its raceline.
+    /// Examines a track from all points of its raceline.
     pub fn of(track: &Track) -> Self {
         let line = &track.raceline;
         let points = line.points();
@@ -67,7 +67,7 @@ impl TrackReport {
                     across += range.unwrap_or(30.0);
                     first_fault(range.is_none(), p.s, "there is no wall beside the raceline");
                     if let (Some(range), Some(drawn)) = (range, drawn(&track.grid, [p.x, p.y], direction)) {
-                        // Past the edge of a post, a hair's breadth decides between near and far.
+                        // At the edge of a post the two may see different walls.
                         let error = drawn - range;
                         map_errors.extend((error.abs() < 0.3).then_some(error));
                     }
@@ -133,7 +133,7 @@ impl Track {
     }
 }
 
-/// How far away the map says the wall is: where the ray enters the first cell that is not free [m].
+/// Distance to the wall in the map: where the ray enters the first cell that is not free [m].
 fn drawn(grid: &OccupancyGrid, from: [f64; 2], direction: [f64; 2]) -> Option<f64> {
     let step = grid.resolution / 20.0;
     (0..6000)
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_in_the_way_is_found() {
+    fn an_obstacle_near_the_raceline_is_found() {
         let mut track = Track::bundled("club").expect("it ships");
         let p = track.raceline.at(10.0);
         let mut walls = track.walls.polylines().to_vec();

@@ -4,13 +4,13 @@ use maps::{CORNERS, OccupancyGrid, solidity, zero_lines};
 
 use crate::{Surface, Wall};
 
-/// The contours between free cells and all others: where the free share of each 3 x 3 block of cells is one half, so that
-/// the cells' staircase becomes a line.
+/// The contours between free cells and all others. They run where the free share of each 3 x 3 block of cells is one
+/// half, so that the staircase of cells becomes a line.
 ///
-/// Each wall is one segment: rays and outlines need no more order.
+/// Each wall is one segment. Rays and outlines need no order.
 pub(crate) fn contours(grid: &OccupancyGrid) -> Vec<Wall> {
     let (width, height) = (grid.width as i64, grid.height as i64);
-    // Nobody drives where the map does not say, so a wall closes it off.
+    // Unknown cells count as walls, so that no car drives into them.
     let free: Vec<f64> = solidity(grid)
         .into_iter()
         .map(|solid| solid.map_or(0.0, |solid| 1.0 - f64::from(solid) / 255.0))
@@ -23,7 +23,7 @@ pub(crate) fn contours(grid: &OccupancyGrid) -> Vec<Wall> {
             0.0
         }
     };
-    // A binomial kernel leaves straight walls where they are and rounds corners by less than a cell.
+    // A binomial kernel keeps straight walls in place and rounds corners by less than a cell.
     let mut share = vec![0.0; free.len()];
     for row in 0..height {
         for column in 0..width {

@@ -1,4 +1,4 @@
-//! The driver: follows a raceline on the *estimate* of the pose, so that a bad estimate costs lap time.
+//! The driver: follows a raceline on the *estimated* pose, so that a bad estimate costs lap time.
 
 use std::time::Duration;
 
@@ -13,28 +13,28 @@ use crate::{Controls, VehicleParams};
 pub struct DriverParams {
     /// From one command to the next.
     pub period: Duration,
-    /// From a command to the start of its effect (radio, controller, servo), which the driver looks ahead over.
+    /// From a command to the start of its effect (radio, controller, servo). The driver predicts the car over this time.
     pub delay: Duration,
     /// Look-ahead distance at standstill [m].
     pub lookahead_base: f64,
     /// Look-ahead distance per speed [s].
     pub lookahead_gain: f64,
-    /// The line's curvature is read this far ahead in time [s], because servo, tyres and inertia answer late.
+    /// The line's curvature is read this far ahead in time [s], because servo, tyres and inertia delay the car.
     pub steering_lead: f64,
-    /// Steering against a yaw rate that is not the line's [s].
+    /// Steering per difference between the line's yaw rate and the car's [s].
     pub yaw_damping: f64,
-    /// Time in which a servo's centre that is off gets known, about [s]; infinite: it never does.
+    /// Time constant with which the driver learns the offset of the servo's centre [s]. Infinite: it never learns it.
     pub trim_time: f64,
     /// Least and most look-ahead [m].
     pub lookahead_range: [f64; 2],
     /// Speed over the raceline's own.
     pub speed_scale: f64,
-    /// The raceline's speed is read this far ahead in time [s], because the car answers late.
+    /// The raceline's speed is read this far ahead in time [s], because the car reacts late.
     pub speed_lookahead: f64,
-    /// Most that is asked for beyond the wheels' speed [m/s]: with the motor controller's gain, what they can bring to the
-    /// floor. Asked for more, they spin.
+    /// Largest commanded speed above the wheels' speed [m/s]. With the motor controller's gain this is the force that the
+    /// tyres can transmit; with more, the wheels spin.
     pub traction: f64,
-    /// Share of the speed given up per metre beside the line [1/m].
+    /// Share of the speed given up per metre of distance from the line [1/m].
     pub error_slowdown: f64,
     /// Distance to keep from a car ahead, bumper to bumper [m].
     pub gap: f64,
@@ -60,10 +60,10 @@ impl Default for DriverParams {
     }
 }
 
-/// What the localizer tells the driver.
+/// The localizer's estimate, as the driver uses it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
-    /// When it is true, since the start of the race.
+    /// Time of the estimate, since the start of the race.
     pub time: Duration,
     /// `map_from_base_link`.
     pub pose: Pose,
@@ -95,45 +95,45 @@ pub enum Manoeuvre {
     Turning(Duration),
 }
 
-/// Model- and acceleration-based pursuit (Becker, Imholz et al., ICRA 2023): the look-ahead point asks for a lateral
-/// acceleration, and a model of the car's tyres says which steering angle gives it. Plain pure pursuit steers too
-/// little at speed, because tyres slip.
+/// Model- and acceleration-based pursuit (Becker, Imholz et al., ICRA 2023). The look-ahead point demands a lateral
+/// acceleration, and a model of the car's tyres gives the steering angle for it. Pure pursuit steers too little at
+/// speed, because tyres slip.
 #[derive(Debug, Clone)]
 pub struct Driver {
     params: DriverParams,
-    /// The car as the driver knows it, on good tyres.
+    /// The driver's model of the car.
     vehicle: VehicleParams,
     manoeuvre: Manoeuvre,
-    /// Since when the car has not moved although told to.
+    /// Since when the car has not moved although commanded to.
     stuck_since: Option<Duration>,
-    /// Steering that takes the car straight on, as far as it is known [rad].
+    /// Learnt steering angle that drives the car straight [rad].
     trim: f64,
 }
 
-/// Further off the line's heading than this [rad] the car is turned round at walking speed.
+/// Beyond this heading error the car is turned round at walking speed [rad].
 const LOST_HEADING: f64 = 1.4;
-/// A turning manoeuvre ends below this [rad].
+/// Below this heading error a turning manoeuvre ends [rad].
 const FOUND_HEADING: f64 = 0.7;
-/// Slower than this [m/s] the tyres roll where they point.
+/// Below this speed the tyres hardly slip sideways [m/s].
 const SLIPPING: f64 = 0.5;
 /// Speed of manoeuvres [m/s].
 const WALKING: f64 = 0.8;
-/// A manoeuvre's leg.
+/// Duration of one leg of a manoeuvre.
 const LEG: Duration = Duration::from_millis(900);
-/// No servo is mounted worse than this [rad].
+/// Largest trim [rad].
 const MOST_TRIM: f64 = 0.05;
-/// Further off the line [m] the servo is not what is wrong.
+/// The trim is learnt within this distance of the line [m]. Larger distances have other causes.
 const NEAR: f64 = 0.1;
-/// Slowed down behind a car ahead so hard [m/s^2]: what taped tyres have left in a bend.
+/// Deceleration behind a car ahead [m/s^2]: what taped tyres can give in a bend.
 pub(crate) const BRAKE_BEHIND: f64 = 2.0;
-/// More room is left to a car that stands [m], none more to one that moves so fast [m/s].
+/// Extra gap to a car that stands [m]. It falls to zero for one that moves at `SPEED_OF_TRAFFIC` [m/s].
 const BACKING_UP: f64 = 0.8;
 const SPEED_OF_TRAFFIC: f64 = 2.0;
-/// Not moving for this long is being stuck.
+/// A car that has not moved for this long is stuck.
 const STUCK: Duration = Duration::from_millis(1500);
 
 impl Driver {
-    /// A driver of such a car.
+    /// A driver whose model of the car is `vehicle`.
     pub fn new(params: DriverParams, vehicle: VehicleParams) -> Self {
         Self {
             params,
@@ -154,13 +154,13 @@ impl Driver {
         &self.params
     }
 
-    /// Forgets what happened before: the car was put back on the line. Its servo is the same.
+    /// Ends manoeuvres, after the car was put back on the line. The trim stays, because the servo is the same.
     pub fn reset(&mut self) {
         self.manoeuvre = Manoeuvre::Racing;
         self.stuck_since = None;
     }
 
-    /// The command at `now`. Without an estimate the car stands.
+    /// The command at `now`. Without an estimate the command is to stand.
     pub fn drive(
         &mut self,
         now: Duration,
@@ -171,7 +171,7 @@ impl Driver {
         let Some(estimate) = estimate.filter(|e| e.pose.is_finite()) else {
             return Controls::default();
         };
-        // Where the car will be when the command takes effect, and where it is heading: the rear axle slips sideways.
+        // The pose when the command takes effect. The rear axle slips sideways.
         let age = (now.as_secs_f64() - estimate.time.as_secs_f64()).clamp(0.0, 0.2);
         let horizon = age + self.params.delay.as_secs_f64();
         let before = line.project([estimate.pose.x, estimate.pose.y]);
@@ -243,17 +243,17 @@ impl Driver {
     ) -> f64 {
         let p = &self.params;
         let there = line.at(s + speed.max(0.0) * p.speed_lookahead).speed * p.speed_scale;
-        // A decimetre and ten degrees are normal: the car slips.
+        // A decimetre and ten degrees are normal, because the car slips.
         let error = (d.abs() - 0.1).max(0.0) + (off_heading.abs() - 0.2).max(0.0);
         let wanted = there * (1.0 - p.error_slowdown * error).clamp(0.3, 1.0);
         let wanted = wanted.min(speed.max(0.0) + p.traction);
         ahead.map_or(wanted, |ahead| wanted.min(self.behind(ahead)))
     }
 
-    /// Speed at which a car ahead is not run into [m/s].
+    /// Speed that avoids running into a car ahead [m/s].
     fn behind(&self, ahead: Ahead) -> f64 {
         let speed = ahead.speed.max(0.0);
-        // Who stands there may have to back up.
+        // A car that stands may have to reverse.
         let gap = self.params.gap + BACKING_UP * (1.0 - speed / SPEED_OF_TRAFFIC).max(0.0);
         let room = ahead.gap - gap;
         let close = speed + 1.5 * room;
@@ -261,8 +261,8 @@ impl Driver {
         close.min(far).max(0.0)
     }
 
-    /// Direction in which the rear axle moves, seen from a car that drives along the line at `s` [rad]. From the line and
-    /// not from the measured yaw rate: steering after one's own yawing would make it grow.
+    /// Direction in which the rear axle moves, relative to a car that drives along the line at `s` [rad]. It is computed
+    /// from the line: feedback of the measured yaw rate would amplify a yaw oscillation.
     fn sideslip(&self, speed: f64, s: f64, line: &Raceline) -> f64 {
         if speed < SLIPPING {
             return 0.0;
@@ -273,14 +273,14 @@ impl Driver {
             .sideslip
     }
 
-    /// Acceleration along the line that its speeds ask for [m/s^2].
+    /// Acceleration along the line that its speed profile demands [m/s^2].
     fn along(&self, s: f64, line: &Raceline) -> f64 {
         const REACH: f64 = 0.2;
         let gain = line.at(s + REACH).speed.powi(2) - line.at(s - REACH).speed.powi(2);
         gain / (4.0 * REACH) * self.params.speed_scale.powi(2)
     }
 
-    /// Yaw acceleration that the line's bends ask for [rad/s^2].
+    /// Yaw acceleration that the line's curvature demands [rad/s^2].
     fn turning_in(&self, s: f64, line: &Raceline) -> f64 {
         const REACH: f64 = 0.3;
         let yaw_rate = |s| {
@@ -291,14 +291,14 @@ impl Driver {
         line.at(s).speed * per_metre * self.params.speed_scale.powi(2)
     }
 
-    /// Steering angle [rad]: the line's own curvature, and what the look-ahead point asks for beyond that.
+    /// Steering angle [rad], from the line's curvature and the correction towards the look-ahead point.
     fn steering(&self, estimate: &Estimate, pose: Pose, sideslip: f64, s: f64, line: &Raceline) -> f64 {
         let p = &self.params;
         let speed = estimate.speed.max(0.5);
         let lookahead = self.lookahead(speed);
         let target = line.at(s + lookahead);
         let course = Pose::new(pose.x, pose.y, pose.heading + sideslip);
-        // A car on the line would cut the bend towards the same point; only the difference is an error.
+        // A car on the line would cut the bend towards the same point. Only the difference is an error.
         let here = line.at(s);
         let on_line = Pose::new(here.x, here.y, here.heading);
         let ahead = line.at(s + speed * p.steering_lead);
@@ -309,22 +309,21 @@ impl Driver {
         let turn = self
             .vehicle
             .turn(speed, lateral, along, self.turning_in(ahead.s, line));
-        // A tail that steps out is caught before it is seen in the position.
+        // The yaw rate shows a sliding tail before the position does.
         let now = line.project([estimate.pose.x, estimate.pose.y]);
         let yaw_error = speed * line.at(now.s).curvature - estimate.yaw_rate;
         turn.steering + self.trim + p.yaw_damping * yaw_error
     }
 
-    /// Distance to the point on the line that is steered at [m].
+    /// Distance to the look-ahead point on the line [m].
     fn lookahead(&self, speed: f64) -> f64 {
         let p = &self.params;
         let [least, most] = p.lookahead_range;
         (p.lookahead_base + p.lookahead_gain * speed).clamp(least, most)
     }
 
-    /// Takes a little of the steering that pursuit asks for at `d` [m] beside the line into the trim, so that what lasts is
-    /// steered before it is seen: integral action (Astrom and Murray, *Feedback Systems*, section 11.1). On `d` and not on
-    /// the steering itself, which the tyres' limit cuts in bends.
+    /// Adds a share of the steering that corrects the distance `d` [m] to the trim: integral action (Astrom and Murray,
+    /// *Feedback Systems*, section 11.1). It integrates `d` rather than the steering, which the tyres limit in bends.
     fn learn_trim(&mut self, speed: f64, d: f64) {
         if speed < SLIPPING || d.abs() > NEAR {
             return;
@@ -382,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn a_servo_that_is_off_gets_known() {
+    fn the_offset_of_the_servo_is_learnt() {
         // A car with the servo's centre 0.01 rad to the left on a circle, on its true pose.
         let line = circle();
         let offset = |trim_time: f64| {
@@ -418,13 +417,13 @@ mod tests {
         let (untrimmed, none) = offset(f64::INFINITY);
         let (trimmed, trim) = offset(DriverParams::default().trim_time);
         assert!(untrimmed > 0.004 && none.abs() < 1e-12, "{untrimmed} m");
-        // What the driver's model of the car does not know is in the trim, too.
+        // The trim also takes up other errors of the driver's model.
         assert!(trimmed.abs() < 0.001, "{trimmed} m");
         assert!((trim + 0.01).abs() < 0.005, "{trim} rad");
     }
 
     #[test]
-    fn a_car_far_off_the_line_says_nothing_of_its_servo() {
+    fn far_off_the_line_no_trim_is_learnt() {
         let line = circle();
         let mut driver = driver();
         for (x, known) in [(4.5, false), (3.5, false), (4.05, true)] {
@@ -432,13 +431,13 @@ mod tests {
             driver.drive(Duration::ZERO, Some(&estimate), None, &line);
             assert_eq!(driver.trim != 0.0, known, "at {x} m");
         }
-        // Nor does any offset for ever.
+        // A lasting offset saturates the trim.
         let estimate = at(Pose::new(4.05, 0.0, PI / 2.0), 3.0);
         for _ in 0..10_000 {
             driver.drive(Duration::ZERO, Some(&estimate), None, &line);
         }
         assert!((driver.trim - MOST_TRIM).abs() < 1e-12, "{}", driver.trim);
-        // The marshals carry the car, not its servo.
+        // The recovery crew carries the car and leaves its servo as it is.
         driver.reset();
         assert!(driver.trim > 0.0);
     }
@@ -470,7 +469,7 @@ mod tests {
                 .speed
         };
         assert!(speed(0.2, 2.0) < 2.0 && speed(1.0, 2.0) > 2.0 && speed(9.0, 2.0) > 2.5);
-        // One that stands may have to back up.
+        // One that stands may have to reverse.
         assert!(speed(1.5, 0.0) <= 0.0 && speed(1.7, 0.0) > 0.0);
     }
 

@@ -1,12 +1,15 @@
 //! A seeded simulator of 1:10 race cars: vehicle, lidar, odometry and driver.
 //!
-//! The crate is a test bench for localizers and the built-in source of `car-node`. It reads no clock, opens no socket and
-//! knows no localizer: the caller moves time on with [`World::step`], takes the sensors' messages as they arrive, and
-//! gives the driver the estimates that a localizer made of them. Only [`Track::load`] and [`Track::save`] touch files.
-//! The same seed and the same estimates give the same race, byte for byte.
+//! It is a test bench for localizers and the built-in data source of `car-node`. The caller advances time with
+//! [`World::step`], receives the sensors' messages, and passes a localizer's estimates to the driver with
+//! [`World::guide`]. The same seed and the same estimates give the same race, byte for byte. The crate also generates
+//! tracks ([`TrackSpec`]).
 //!
-//! What is true (the [`Walls`], line segments) is not what the localizer is given (the map, a grid that was drawn by
-//! driving past those walls with a noisy laser), so map error is real here as it is on a track.
+//! It never reads a clock, never opens a socket, and does not depend on a localizer. Only [`Track::load`],
+//! [`Track::find`] and [`Track::save`] touch files.
+//!
+//! The cars drive between [`Walls`], which are line segments. The localizer gets a map that was drawn from noisy laser
+//! scans of these walls, so it has the errors of a real map.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -26,7 +29,7 @@
 //! while laps < 2 {
 //!     for output in world.step() {
 //!         match output.message {
-//!             // A localizer would take these in; the truth stands in for it here.
+//!             // A localizer would use these; here the truth takes its place.
 //!             Message::Scan(scan) => assert_eq!(scan.ranges.len(), 1081),
 //!             Message::Odometry(odometry) => {
 //!                 let truth = world.truth(output.car);
@@ -45,28 +48,50 @@
 //! }
 //! # Ok::<(), maps::RacelineFault>(())
 //! ```
+mod car;
+mod car_setup;
 mod check;
+mod contact_timer;
 mod contour;
 mod driver;
 mod generator;
+mod grip;
 mod lidar;
+mod obstacle;
 mod odometry;
+mod output;
+mod recovery_crew;
+mod steady_turn;
+mod tick;
 mod tire;
 mod track;
 mod vehicle;
+mod vehicle_params;
+mod vehicle_state;
+mod wall;
+mod wall_file;
 mod walls;
 mod world;
 
+pub use car_setup::{CarSetup, Guidance};
 pub use check::TrackReport;
 pub use driver::{Ahead, Driver, DriverParams, Estimate, Manoeuvre};
 pub use generator::{
-    BUNDLED, BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map,
-    minimum_curvature, slowed_to, speed_profile,
+    BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map, minimum_curvature,
+    slowed_to, speed_profile,
 };
-pub use lidar::{Lidar, LidarParams, Obstacle, Scan};
+pub use grip::Grip;
+pub use lidar::{Lidar, LidarParams, Scan};
+pub use obstacle::Obstacle;
 pub use odometry::{Gyro, Motion, Odometry, OdometryParams, OdometrySensor, YawSource};
+pub use output::{Contact, Lap, Message, Output, Truth};
+pub use steady_turn::Turn;
+pub use tick::TICK;
 pub use tire::TireParams;
-pub use track::Track;
-pub use vehicle::{Controls, Grip, Turn, Vehicle, VehicleParams, VehicleState, outline};
-pub use walls::{Hit, Surface, Wall, Walls};
-pub use world::{CarSetup, Crash, Guidance, Lap, Message, Output, TICK, Truth, World};
+pub use track::{BUNDLED, Track};
+pub use vehicle::{Controls, Vehicle};
+pub use vehicle_params::{VehicleParams, outline};
+pub use vehicle_state::VehicleState;
+pub use wall::{Hit, Surface, Wall};
+pub use walls::Walls;
+pub use world::World;

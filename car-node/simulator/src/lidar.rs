@@ -9,7 +9,7 @@ use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use crate::{Hit, Surface, Walls};
+use crate::{Hit, Obstacle, Walls};
 
 /// A scanner's parameters. The defaults are a Hokuyo UST-10LX (its data sheet; 1081 beams over 270 degrees at 40 Hz, of
 /// which the sweep takes three quarters).
@@ -24,25 +24,25 @@ pub struct LidarParams {
     pub period: Duration,
     /// From the first to the last beam of a scan.
     pub sweep: Duration,
-    /// Shortest range that is a measurement [m].
+    /// Shortest valid range [m].
     pub range_min: f64,
     /// Longest range [m].
     pub range_max: f64,
     /// Standard deviation of a range [m].
     pub noise: f64,
-    /// Standard deviation of a beam's direction [rad]: it stands for the beam's width, and makes grazing beams noisy
-    /// and edges ragged.
+    /// Standard deviation of a beam's direction [rad]. It models the beam's width: grazing beams become noisy and edges
+    /// ragged.
     pub jitter: f64,
-    /// Share of the beams lost for no reason.
+    /// Share of the beams lost at random.
     pub dropout: f64,
     /// Returned power (reflectance x cosine of incidence / squared range [1/m^2]) at which half the beams are lost. The
     /// data sheet's 30 m on white paper is 0.001.
     pub half_power: f64,
-    /// Where the scanner sits.
+    /// Pose of the scanner on the car.
     pub base_link_from_laser: Pose,
-    /// From a scan's last beam to its arrival: least.
+    /// Shortest time from a scan's last beam to its arrival.
     pub transport: Duration,
-    /// From a scan's last beam to its arrival: most, beyond the least. Real cars log 17 to 22 ms after the stamp.
+    /// Largest random addition to `transport`. Real cars log scans 17 to 22 ms after their stamp.
     pub transport_jitter: Duration,
 }
 
@@ -71,7 +71,7 @@ impl Default for LidarParams {
 }
 
 impl LidarParams {
-    /// Share of such beams that do not come back: a detector with a soft threshold on the returned power.
+    /// Probability that such a beam has no return: a detector with a soft threshold on the returned power.
     pub(crate) fn loss(&self, hit: &Hit) -> f64 {
         let distance = hit.range.max(0.5);
         let power = hit.surface.reflectance() * hit.incidence / (distance * distance);
@@ -93,51 +93,12 @@ pub struct Scan {
     pub angle_increment: f64,
     /// From one beam to the next [s].
     pub time_increment: f64,
-    /// Shortest range that is a measurement [m].
+    /// Shortest valid range [m].
     pub range_min: f64,
-    /// Longest range that is a measurement [m].
+    /// Longest valid range [m].
     pub range_max: f64,
-    /// A range for each beam [m]; infinite where nothing came back.
+    /// A range for each beam [m]; infinite where there was no return.
     pub ranges: Vec<f32>,
-}
-
-/// Another car, as a box.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Obstacle {
-    /// The middle of the box.
-    pub map_from_centre: Pose,
-    /// Half its length and half its width [m].
-    pub half: [f64; 2],
-}
-
-impl Obstacle {
-    fn cast(&self, origin: [f64; 2], direction: [f64; 2]) -> Option<Hit> {
-        let Pose { x, y, heading } = self.map_from_centre;
-        let to = [x - origin[0], y - origin[1]];
-        let miss = direction[0] * to[1] - direction[1] * to[0];
-        let radius = self.half[0].hypot(self.half[1]);
-        if miss.abs() > radius || direction[0] * to[0] + direction[1] * to[1] < -radius {
-            return None;
-        }
-        // The slab test, in the box's own frame.
-        let (sin, cos) = heading.sin_cos();
-        let turn = |v: [f64; 2]| [cos * v[0] + sin * v[1], cos * v[1] - sin * v[0]];
-        let (start, along) = (turn(to.map(|v| -v)), turn(direction));
-        let (mut enter, mut leave, mut incidence) = (f64::NEG_INFINITY, f64::INFINITY, 1.0);
-        for axis in 0..2 {
-            let near = (-self.half[axis].copysign(along[axis]) - start[axis]) / along[axis];
-            let far = (self.half[axis].copysign(along[axis]) - start[axis]) / along[axis];
-            if near > enter {
-                (enter, incidence) = (near, along[axis].abs());
-            }
-            leave = leave.min(far);
-        }
-        (enter >= 0.0 && enter <= leave).then_some(Hit {
-            range: enter,
-            incidence,
-            surface: Surface::Plain,
-        })
-    }
 }
 
 /// A running scanner.
@@ -167,7 +128,7 @@ impl Lidar {
     }
 
     /// Measures every beam that is due in `[from, to)`, while `map_from_base_link` moves evenly from the first to the
-    /// second pose. Returns a scan and when it arrives, once its last beam is in.
+    /// second pose. Returns a scan and its time of arrival once its last beam is measured.
     pub fn sense(
         &mut self,
         [from, to]: [Duration; 2],
@@ -243,7 +204,7 @@ impl Lidar {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Wall;
+    use crate::{Surface, Wall};
     use rand::SeedableRng;
 
     const TICK: Duration = Duration::from_micros(2500);
@@ -296,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_has_the_promised_spread() {
+    fn noise_has_its_standard_deviation() {
         let params = LidarParams {
             dropout: 0.0,
             ..LidarParams::default()
@@ -314,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn black_walls_get_lost_and_plain_ones_do_not() {
+    fn beams_to_black_walls_are_lost() {
         let lost = |surface| {
             let scan = scan(LidarParams::default(), &room(surface), &[], 0.0);
             scan.ranges.iter().filter(|r| r.is_infinite()).count()
@@ -325,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_that_is_grazed_gets_lost() {
+    fn beams_that_graze_a_wall_are_lost() {
         // A corridor 2 m wide: its wall returns where it is met at 20 degrees, 3 m away, and not at 3 degrees, 19 m away.
         let points = vec![
             [-29.0, -1.0],
@@ -350,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn as_many_beams_drop_out_as_promised() {
+    fn as_many_beams_drop_out_as_set() {
         let params = LidarParams {
             dropout: 0.1,
             ..perfect()

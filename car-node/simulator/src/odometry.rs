@@ -1,4 +1,4 @@
-//! Wheel odometry and gyroscope, with the faults of real ones.
+//! Wheel odometry and gyroscope, with the errors of real ones.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use rand::rngs::StdRng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-/// Where odometry's yaw rate comes from.
+/// The source of odometry's yaw rate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum YawSource {
@@ -25,9 +25,9 @@ pub struct OdometryParams {
     pub period: Duration,
     /// From its stamp to its arrival.
     pub transport: Duration,
-    /// Where the yaw rate comes from.
+    /// The source of the yaw rate.
     pub yaw_source: YawSource,
-    /// Share by which the speed calibration is off: tyres wear and grow.
+    /// Relative error of the speed calibration: tyres wear, and grow with speed.
     pub speed_scale: f64,
     /// Standard deviation of a speed reading [m/s].
     pub speed_noise: f64,
@@ -39,7 +39,7 @@ pub struct OdometryParams {
     pub gyro_walk: f64,
     /// Standard deviation of a yaw-rate reading [rad/s].
     pub gyro_noise: f64,
-    /// Share by which the gyroscope's scale is off.
+    /// Relative error of the gyroscope's scale.
     pub gyro_scale: f64,
 }
 
@@ -64,7 +64,7 @@ impl Default for OdometryParams {
 /// One message of wheel odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Odometry {
-    /// When it was true, since the start of the race.
+    /// Time of the measurement, since the start of the race.
     pub stamp: Duration,
     /// `odom_from_base_link`.
     pub pose: Pose,
@@ -77,13 +77,13 @@ pub struct Odometry {
 /// One reading of the gyroscope.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gyro {
-    /// When it was true, since the start of the race.
+    /// Time of the measurement, since the start of the race.
     pub stamp: Duration,
     /// Yaw rate, left positive [rad/s].
     pub yaw_rate: f64,
 }
 
-/// What the two measure at one moment.
+/// The true motion that both sensors measure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
     /// Speed of the wheels' circumference [m/s].
@@ -109,7 +109,7 @@ pub struct OdometrySensor {
 
 impl OdometrySensor {
     /// The gyroscope's latest reading [rad/s].
-    pub fn turning(&self) -> f64 {
+    pub fn gyro_yaw_rate(&self) -> f64 {
         self.latest_gyro
     }
 
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn spinning_wheels_drive_odometry_on() {
+    fn odometry_measures_the_wheels_and_not_the_car() {
         let motion = Motion {
             wheel_speed: 3.0,
             yaw_rate: 0.0,

@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TireParams {
-    /// Stiffness factor B: how early the force builds up.
+    /// Stiffness factor B: the slope at small slip.
     pub stiffness: f64,
-    /// Shape factor C: how far the force falls when sliding.
+    /// Shape factor C: the force at large slip over the peak force.
     pub shape: f64,
-    /// Curvature factor E: how round the peak is.
+    /// Curvature factor E: the roundness of the peak.
     pub curvature: f64,
     /// Friction coefficient at the peak and at `nominal_load`: factor D over the load.
     pub friction: f64,
@@ -38,7 +38,7 @@ impl TireParams {
     /// Greatest force at a load [N].
     pub fn peak(&self, load: f64) -> f64 {
         let overload = load / self.nominal_load - 1.0;
-        // A tyre far beyond its nominal load still grips.
+        // A tyre far beyond its nominal load keeps some grip.
         self.friction * (1.0 - self.load_sensitivity * overload).max(0.3) * load
     }
 
@@ -62,8 +62,8 @@ impl TireParams {
         f64::midpoint(low, high)
     }
 
-    /// The slip on the rising side that makes `force` [N] at `load` [N]: signed, and the peak's slip for a force
-    /// that the tyre cannot make.
+    /// The signed slip below the peak that makes `force` [N] at `load` [N]. For a force beyond the peak, the slip of the
+    /// peak.
     pub fn slip_for(&self, load: f64, force: f64) -> f64 {
         let share = (force / self.peak(load)).abs();
         let (mut low, mut high) = (0.0, self.peak_slip());

@@ -1,4 +1,4 @@
-//! A track: what is true (walls) and what the car is given (map and raceline).
+//! A track: the true walls, and the map and raceline that the car is given.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -9,8 +9,8 @@ use maps::{MapError, OccupancyGrid, Raceline, read_text};
 use crate::generator::slowed_to;
 use crate::{SpeedParams, Walls};
 
-/// What our car is asked for on a line that was made for another one, whose bends may begin at once: a little less than on
-/// a line of its own. At that, it spins on taped tyres, even when it knows its true pose.
+/// Limits of the simulated car on a line that was made for another car and whose bends may begin abruptly. They are a
+/// little lower than on its own lines. Even so, it spins on taped tyres, also on its true pose.
 const FOREIGN: SpeedParams = SpeedParams {
     lateral: 4.4,
     drive: 3.7,
@@ -18,25 +18,28 @@ const FOREIGN: SpeedParams = SpeedParams {
     top: 7.6,
 };
 
+/// The tracks that ship, by name.
+pub const BUNDLED: [&str; 4] = ["club", "hall", "park", "mirror"];
+
 /// A track to race on.
 #[derive(Debug, Clone)]
 pub struct Track {
-    /// What to call it.
+    /// Its name.
     pub name: String,
     /// The map that the localizer gets.
     pub grid: OccupancyGrid,
     /// The line that the driver follows.
     pub raceline: Raceline,
-    /// The walls as they are.
+    /// The true walls.
     pub walls: Walls,
 }
 
 impl Track {
-    /// Reads `map.yaml`, `raceline.csv` and `walls.csv` from a folder, or a map file and what lies beside it. `raceline`
+    /// Reads `map.yaml`, `raceline.csv` and `walls.csv` from a folder, or a map file and the files beside it. `raceline`
     /// names another file for the line, in any format that [`Raceline::parse`] reads.
     ///
-    /// Without `walls.csv`, as for the map of a real track, the walls are taken from the map, and the raceline, which was
-    /// made for another car, is slowed to what ours can do.
+    /// Without `walls.csv`, as for the map of a real track, the walls are taken from the map. The raceline, which was made
+    /// for another car, is then slowed to the limits of the simulated one.
     pub fn load(path: impl AsRef<Path>, raceline: Option<&Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
         let (folder, map) = if path.is_dir() {
@@ -65,8 +68,8 @@ impl Track {
         })
     }
 
-    /// Writes the track's files into a folder, which is made if need be, with the description that it was made from as
-    /// `track.yaml`. All of them or none: what stood there stays until every new file is on the disk.
+    /// Writes the track's files and its description `track.yaml` into a folder, which is made if needed. It writes all files
+    /// or none: older files are replaced only when every new one is on the disk.
     pub fn save(&self, folder: impl AsRef<Path>, description: &str) -> Result<(), MapError> {
         let folder = folder.as_ref();
         let (yaml, png) = (self.grid.to_yaml("map.png"), self.grid.to_png());
@@ -76,7 +79,7 @@ impl Track {
             ("map.png", &png),
             ("raceline.csv", line.as_bytes()),
             ("walls.csv", walls.as_bytes()),
-            // Last, because it is what makes the folder a track.
+            // Last, because a folder with this file counts as a track.
             ("map.yaml", yaml.as_bytes()),
         ];
         let fault = |path: &Path, source| MapError::Read {
@@ -94,7 +97,7 @@ impl Track {
             fs::write(part(name), bytes).map_err(|source| fault(&path, source))
         });
         if written.is_err() {
-            // What cannot be removed now could not be written either.
+            // A file that cannot be removed was not written.
             for (name, _) in &files {
                 fs::remove_file(part(name)).ok();
             }
@@ -109,7 +112,7 @@ impl Track {
         })
     }
 
-    /// A track that ships, by name (one of [`BUNDLED`](crate::BUNDLED)). It is part of the program: no file is read.
+    /// A track that ships, by name (one of [`BUNDLED`]). It is part of the program; no file is read.
     pub fn bundled(name: &str) -> Option<Self> {
         macro_rules! files {
             ($name:literal) => {

@@ -1,295 +1,25 @@
 //! The car's dynamics: a single-track model with combined slip, load transfer and a rigid drive line.
 
-use maps::{Pose, wrap_angle};
-use serde::{Deserialize, Serialize};
+use maps::Pose;
 
-use crate::TireParams;
+use crate::grip::{GRAVITY, Grip};
+use crate::{TireParams, VehicleParams, VehicleState};
 
-/// Gravity [m/s^2].
-pub(crate) const GRAVITY: f64 = 9.81;
-
-/// Step of the integration [s]: the drive line against the tyres rings at about 100 rad/s, which a Runge-Kutta step
-/// of this length follows with an error far below a micrometre.
+/// Step of the integration [s]. The drive line and the tyres oscillate at about 100 rad/s; with this step the error of a
+/// Runge-Kutta step stays far below a micrometre.
 const STEP: f64 = 0.001_25;
 
-/// Below this rolling speed [m/s] a tyre's slip is damped as if it rolled at it; at rest the slip would otherwise
-/// be a spring without a damper (Pacejka, section 8.6).
+/// Below this rolling speed a tyre's slip is damped as at this speed [m/s]. At rest the slip would otherwise be a spring
+/// without a damper (Pacejka, section 8.6).
 const LOW_SPEED: f64 = 0.5;
 
-/// A 1:10 car on a four-wheel-drive chassis with a rigid centre shaft, as teams race it: both axles turn at the motor's
-/// speed, so wheel odometry *is* motor speed.
-///
-/// The defaults are a car of the paper's weight and wheelbase (3.5 kg, 0.31 m); inertia and centre of gravity are
-/// those published for such cars (O'Kelly et al., *F1TENTH*, 2020); tyre shape factors those of identified F1TENTH
-/// tyres (front softer than rear: the car understeers), friction from the lateral pull of the paper's table I. Load moves
-/// between the axles; what bends move from side to side is left out, as in every single-track model: with these tyres'
-/// load sensitivity it costs an axle less than 2 % of its grip.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct VehicleParams {
-    /// Mass [kg].
-    pub mass: f64,
-    /// Moment of inertia about the vertical axis [kg m^2].
-    pub yaw_inertia: f64,
-    /// From the centre of gravity forward to the front axle [m].
-    pub front_axle: f64,
-    /// From the centre of gravity back to the rear axle, which is `base_link` [m].
-    pub rear_axle: f64,
-    /// Height of the centre of gravity [m].
-    pub cg_height: f64,
-    /// Both front tyres.
-    pub front_tires: TireParams,
-    /// Both rear tyres.
-    pub rear_tires: TireParams,
-    /// Rolling radius of a wheel [m].
-    pub wheel_radius: f64,
-    /// Inertia of wheels, shafts and rotor, seen at the wheels [kg m^2].
-    pub driveline_inertia: f64,
-    /// Greatest driving force at the tyres, from the current limit [N].
-    pub max_drive_force: f64,
-    /// Greatest braking force at the tyres, from the regenerative current limit [N].
-    pub max_brake_force: f64,
-    /// Greatest mechanical power at the wheels [W].
-    pub max_power: f64,
-    /// Force of the motor controller per error of wheel speed [N/(m/s)].
-    pub speed_gain: f64,
-    /// Rolling resistance over weight.
-    pub rolling_resistance: f64,
-    /// Air drag over squared speed [N/(m/s)^2].
-    pub drag: f64,
-    /// Largest steering angle, either way [rad].
-    pub max_steering: f64,
-    /// Fastest change of the steering angle [rad/s].
-    pub steering_rate: f64,
-    /// Angle by which the servo's centre is off, left positive: cars are trimmed by eye [rad].
-    pub steering_offset: f64,
-    /// The servo's control gain [1/s].
-    pub steering_gain: f64,
-    /// Length and width of the body [m].
-    pub body: [f64; 2],
-    /// From the rear axle back to the rear bumper [m].
-    pub rear_overhang: f64,
-}
-
-impl Default for VehicleParams {
-    fn default() -> Self {
-        let tires = TireParams {
-            stiffness: 6.0,
-            shape: 1.5,
-            curvature: 0.2,
-            friction: Grip::HQ.friction(),
-            nominal_load: 3.5 * GRAVITY / 2.0,
-            load_sensitivity: 0.08,
-            relaxation_length: 0.06,
-        };
-        Self {
-            mass: 3.5,
-            yaw_inertia: 0.058,
-            front_axle: 0.162,
-            rear_axle: 0.148,
-            cg_height: 0.074,
-            front_tires: tires,
-            rear_tires: TireParams {
-                stiffness: 11.0,
-                ..tires
-            },
-            wheel_radius: 0.054,
-            driveline_inertia: 1.3e-3,
-            max_drive_force: 32.0,
-            max_brake_force: 32.0,
-            max_power: 260.0,
-            speed_gain: 60.0,
-            rolling_resistance: 0.02,
-            drag: 0.02,
-            max_steering: 0.42,
-            steering_rate: 6.0,
-            steering_offset: 0.0,
-            steering_gain: 40.0,
-            body: [0.50, 0.28],
-            rear_overhang: 0.09,
-        }
-    }
-}
-
-impl VehicleParams {
-    /// Distance between the axles [m].
-    pub fn wheelbase(&self) -> f64 {
-        self.front_axle + self.rear_axle
-    }
-
-    /// The same car on another floor or other tyres.
-    #[must_use]
-    pub fn with_grip(mut self, grip: Grip) -> Self {
-        self.front_tires.friction = grip.friction();
-        self.rear_tires.friction = grip.friction();
-        self
-    }
-
-    /// Understeer gradient K [s^2/m]: at small lateral acceleration the car turns at
-    /// `v delta / (wheelbase + K v^2)` (Rajamani, *Vehicle Dynamics and Control*, section 3.3).
-    pub fn understeer_gradient(&self) -> f64 {
-        let [front, rear] = self.static_loads();
-        let front_stiffness = self.front_tires.linear_stiffness(front);
-        let rear_stiffness = self.rear_tires.linear_stiffness(rear);
-        self.mass / self.wheelbase() * (self.rear_axle / front_stiffness - self.front_axle / rear_stiffness)
-    }
-
-    /// Loads of the front and the rear axle at rest [N].
-    pub fn static_loads(&self) -> [f64; 2] {
-        let weight = self.mass * GRAVITY / self.wheelbase();
-        [weight * self.rear_axle, weight * self.front_axle]
-    }
-
-    /// How the car turns at `speed` [m/s] with `lateral` acceleration [m/s^2] while it gains or loses speed by `along`
-    /// [m/s^2] and turns ever faster by `yaw_acceleration` [rad/s^2], from the tyres' whole curve; what grip cannot give is
-    /// cut to a share of the tyres' peak. It is the look-up table of MAP (Becker, Imholz et al., ICRA 2023), computed when
-    /// asked for.
-    pub fn turn(&self, speed: f64, lateral: f64, along: f64, yaw_acceleration: f64) -> Turn {
-        let speed = speed.max(0.1);
-        let yaw_rate = lateral / speed;
-        let [front, rear] = self.static_loads();
-        let shift = (self.mass * along * self.cg_height / self.wheelbase()).clamp(-rear, front);
-        let weight = front + rear;
-        // Each axle makes its share of the side force, and of the force along, as much as it is loaded.
-        let couple = self.yaw_inertia * yaw_acceleration / self.wheelbase();
-        let slip = |tires: &TireParams, load: f64, arm: f64, couple: f64| {
-            let across = self.mass * lateral * arm / self.wheelbase() + couple;
-            let force = across.hypot(self.mass * along * load / weight);
-            // Theoretical slip is the tangent of the slip angle, but for the wheels' own slip along.
-            let usable = force.min(USABLE * tires.peak(load));
-            tires.slip_for(load, usable) * across / force.max(1e-9)
-        };
-        let front = slip(
-            &self.front_tires,
-            (front - shift).max(1.0),
-            self.rear_axle,
-            couple,
-        );
-        let rear = slip(
-            &self.rear_tires,
-            (rear + shift).max(1.0),
-            self.front_axle,
-            -couple,
-        );
-        let front_heading = (self.wheelbase() * yaw_rate - speed * rear).atan2(speed);
-        Turn {
-            steering: (front_heading + front.atan()).clamp(-self.max_steering, self.max_steering),
-            sideslip: -rear.atan(),
-        }
-    }
-}
-
-/// Share of a tyre's peak force that is asked for: closer to the peak, slip grows much and force no more, and a tyre that
-/// was steered so far answers late when less is needed.
-const USABLE: f64 = 0.82;
-
-/// A turn, as the tyres make it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Turn {
-    /// Steering angle that makes it [rad].
-    pub steering: f64,
-    /// Direction in which the rear axle moves, seen from the car [rad]: it slips out of the turn, so the nose points in.
-    pub sideslip: f64,
-}
-
-/// How well the tyres hold, as the paper measures it: pulling the standing car sideways.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Grip {
-    /// Force at which a car of 3.5 kg slides sideways [N].
-    pub lateral_pull: f64,
-}
-
-impl Grip {
-    /// Clean tyres: high-quality odometry (paper, table I).
-    pub const HQ: Self = Self { lateral_pull: 26.0 };
-    /// Taped tyres: low-quality odometry (paper, table I).
-    pub const LQ: Self = Self { lateral_pull: 19.0 };
-
-    /// Friction coefficient.
-    pub fn friction(self) -> f64 {
-        self.lateral_pull / (3.5 * GRAVITY)
-    }
-}
-
-/// What the driver asks of the car.
+/// The driver's command.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Controls {
-    /// Wheel speed that the motor controller shall hold [m/s].
+    /// Set point of the wheel speed [m/s].
     pub speed: f64,
-    /// Steering angle that the servo shall hold, left positive [rad].
+    /// Set point of the steering angle, left positive [rad].
     pub steering: f64,
-}
-
-/// Everything that moves.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct VehicleState {
-    /// Position of the centre of gravity in `map` [m].
-    pub x: f64,
-    /// Position of the centre of gravity in `map` [m].
-    pub y: f64,
-    /// Heading, not wrapped [rad].
-    pub heading: f64,
-    /// Speed of the centre of gravity, forwards [m/s].
-    pub vx: f64,
-    /// Speed of the centre of gravity, to the left [m/s].
-    pub vy: f64,
-    /// Yaw rate, left positive [rad/s].
-    pub yaw_rate: f64,
-    /// Speed of the wheels' circumference [m/s].
-    pub wheel_speed: f64,
-    /// Slip of the front tyres, longitudinal and lateral, as far as it has built up.
-    pub front_slip: [f64; 2],
-    /// Slip of the rear tyres.
-    pub rear_slip: [f64; 2],
-    /// Longitudinal acceleration as the springs have followed it [m/s^2]: it shifts load between the axles.
-    pub pitch_acceleration: f64,
-    /// Steering angle of the front wheels [rad].
-    pub steering: f64,
-}
-
-const SIZE: usize = 13;
-
-impl VehicleState {
-    fn array(&self) -> [f64; SIZE] {
-        let (front, rear) = (self.front_slip, self.rear_slip);
-        [
-            self.x,
-            self.y,
-            self.heading,
-            self.vx,
-            self.vy,
-            self.yaw_rate,
-            self.wheel_speed,
-            front[0],
-            front[1],
-            rear[0],
-            rear[1],
-            self.pitch_acceleration,
-            self.steering,
-        ]
-    }
-
-    fn from_array(a: [f64; SIZE]) -> Self {
-        Self {
-            x: a[0],
-            y: a[1],
-            heading: a[2],
-            vx: a[3],
-            vy: a[4],
-            yaw_rate: a[5],
-            wheel_speed: a[6],
-            front_slip: [a[7], a[8]],
-            rear_slip: [a[9], a[10]],
-            pitch_acceleration: a[11],
-            steering: a[12],
-        }
-    }
-
-    /// `self + rate * time`.
-    fn advanced(&self, rate: &Self, time: f64) -> Self {
-        let (state, rate) = (self.array(), rate.array());
-        Self::from_array(std::array::from_fn(|i| state[i] + rate[i] * time))
-    }
 }
 
 /// A car in motion.
@@ -326,7 +56,7 @@ impl Vehicle {
         &self.params
     }
 
-    /// Other tyres, or another floor, from now on.
+    /// Changes the grip.
     pub fn set_grip(&mut self, grip: Grip) {
         self.params = self.params.with_grip(grip);
     }
@@ -336,7 +66,7 @@ impl Vehicle {
         &self.state
     }
 
-    /// For what acts on the car from outside: walls.
+    /// The state, for forces from outside such as walls.
     pub(crate) fn state_mut(&mut self) -> &mut VehicleState {
         &mut self.state
     }
@@ -360,7 +90,7 @@ impl Vehicle {
         [s.vx * cos - s.vy * sin, s.vx * sin + s.vy * cos]
     }
 
-    /// Pushed from outside: moved by an offset [m], and its velocity changed [m/s], both in `map`.
+    /// Moves the car by an offset [m] and changes its velocity [m/s], both in `map`.
     pub(crate) fn push(&mut self, offset: [f64; 2], velocity: [f64; 2]) {
         let s = &mut self.state;
         let (sin, cos) = s.heading.sin_cos();
@@ -369,7 +99,7 @@ impl Vehicle {
         s.vy += velocity[1] * cos - velocity[0] * sin;
     }
 
-    /// Lets `duration` [s] pass (rounded to whole steps of 1.25 ms, at least one).
+    /// Integrates over `duration` [s], rounded to whole steps of 1.25 ms, at least one.
     pub fn drive(&mut self, controls: Controls, duration: f64) {
         let steps = (duration / STEP).round().max(1.0) as usize;
         for _ in 0..steps {
@@ -428,13 +158,13 @@ impl Vehicle {
                 / circumference_mass,
             front_slip: slip_rate(&p.front_tires, s.front_slip, front, s.wheel_speed),
             rear_slip: slip_rate(&p.rear_tires, s.rear_slip, rear, s.wheel_speed),
-            // The springs follow within some 30 ms.
+            // The springs follow with a time constant of 30 ms.
             pitch_acceleration: (acceleration - s.pitch_acceleration) / 0.03,
             steering: (steering_error * p.steering_gain).clamp(-p.steering_rate, p.steering_rate),
         }
     }
 
-    /// Loads of the axles [N] when braking or driving shifts them.
+    /// Loads of the axles under a longitudinal acceleration [N].
     fn loads(&self, acceleration: f64) -> [f64; 2] {
         let p = &self.params;
         let [front, rear] = p.static_loads();
@@ -457,29 +187,14 @@ impl Vehicle {
     }
 }
 
-/// Time derivative of a tyre's slip: the tread is carried along by the sliding speed and released by rolling. Its steady
-/// state is the theoretical slip when driving and the practical slip when braking, so both end at 1.
+/// Time derivative of a tyre's slip: the sliding speed builds it up and rolling releases it. Its steady state is the
+/// theoretical slip when driving and the practical slip when braking, so both end at 1.
 fn slip_rate(tires: &TireParams, slip: [f64; 2], axle: [f64; 2], wheel_speed: f64) -> [f64; 2] {
     let rolling = wheel_speed.abs().max(axle[0].abs()).max(LOW_SPEED);
     [
         (wheel_speed - axle[0] - rolling * slip[0]) / tires.relaxation_length,
         (-axle[1] - rolling * slip[1]) / tires.relaxation_length,
     ]
-}
-
-/// The car's outline at a pose of `base_link`: its corners in `map`, counter-clockwise [m].
-pub fn outline(params: &VehicleParams, map_from_base_link: Pose) -> [[f64; 2]; 4] {
-    let (back, half) = (-params.rear_overhang, params.body[1] / 2.0);
-    let front = back + params.body[0];
-    [[front, -half], [front, half], [back, half], [back, -half]]
-        .map(|corner| map_from_base_link.transform(corner))
-}
-
-impl From<&VehicleState> for Pose {
-    /// The pose of the centre of gravity.
-    fn from(state: &VehicleState) -> Self {
-        Self::new(state.x, state.y, wrap_angle(state.heading))
-    }
 }
 
 #[cfg(test)]
@@ -495,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_car_left_alone_stays_where_it_is() {
+    fn a_car_at_rest_stays_where_it_is() {
         let mut vehicle = Vehicle::at_rest(VehicleParams::default(), Pose::new(1.0, 2.0, 3.0));
         vehicle.drive(Controls::default(), 10.0);
         assert!(vehicle.pose().distance(Pose::new(1.0, 2.0, 3.0)) < 1e-9);
@@ -568,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn the_servo_turns_no_faster_and_no_further_than_it_can() {
+    fn the_servo_keeps_its_rate_and_its_range() {
         let params = VehicleParams::default();
         let mut vehicle = Vehicle::at_rest(params, Pose::IDENTITY);
         let all = Controls {
@@ -591,21 +306,6 @@ mod tests {
     }
 
     #[test]
-    fn the_steering_for_a_turn_gives_that_turn() {
-        let params = VehicleParams::default();
-        for (speed, lateral) in [(2.0, 2.0), (3.0, 4.0), (5.0, 5.0), (6.0, -6.0)] {
-            let vehicle = settled(&params, speed, params.turn(speed, lateral, 0.0, 0.0).steering);
-            let s = vehicle.state();
-            let reached = s.vx * s.yaw_rate;
-            // The formula leaves out the tyres' rolling and driving share of the grip.
-            assert!(
-                (reached / lateral - 1.0).abs() < 0.1,
-                "{speed} m/s: wanted {lateral}, got {reached}"
-            );
-        }
-    }
-
-    #[test]
     fn lateral_acceleration_ends_at_the_paper_s_lateral_pull() {
         for grip in [Grip::HQ, Grip::LQ] {
             let params = VehicleParams::default().with_grip(grip);
@@ -625,7 +325,7 @@ mod tests {
                 let acceleration = (after[0] - before[0]).hypot(after[1] - before[1]) / 0.02;
                 greatest = greatest.max(acceleration * params.mass);
             }
-            // The axles do not peak together, and a lighter one grips a little better.
+            // The axles do not reach their peaks together, and a lighter one grips a little better.
             assert!(
                 (0.95..1.02).contains(&(greatest / grip.lateral_pull)),
                 "{greatest} N of {} N",
@@ -637,7 +337,7 @@ mod tests {
     #[test]
     fn braking_distance_is_that_of_the_friction_coefficient() {
         for grip in [Grip::HQ, Grip::LQ] {
-            // The best brake is as strong as the tyres, and no stronger: then the wheels would lock.
+            // The best brake is as strong as the tyres. With a stronger one the wheels lock.
             let distance = |share: f64| {
                 let params = VehicleParams {
                     max_brake_force: share * grip.lateral_pull,
@@ -690,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn coasting_ends_where_resistance_says() {
+    fn coasting_distance_is_that_of_the_resistance() {
         // Rolling resistance only: distance = v^2 / (2 c g), the turning parts adding to the mass.
         let params = VehicleParams {
             drag: 0.0,
@@ -708,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn the_drive_line_never_makes_energy() {
+    fn the_drive_line_never_adds_energy() {
         // With the motor off, kinetic energy only falls, whatever the steering does.
         let params = VehicleParams {
             max_drive_force: 1e-9,

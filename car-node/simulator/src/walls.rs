@@ -1,56 +1,12 @@
-//! The true walls: line segments that the lidar sees and the car hits. The map is only somebody's drawing of them.
+//! The true walls: line segments that the lidar measures and the car hits, with an index for rays.
 
-use std::fmt::Write;
-
-use maps::{MapError, OccupancyGrid};
-use serde::{Deserialize, Serialize};
+use maps::OccupancyGrid;
 
 use crate::contour::contours;
+use crate::{Hit, Surface, Wall};
 
-/// Edge of an index cell [m]: about what a ray crosses between two looks at the list of segments.
+/// Edge of a cell of the index [m].
 const CELL: f64 = 0.5;
-/// How far walls may be apart [m].
-const MOST: f64 = 500.0;
-
-/// What a wall is made of, as the laser sees it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Surface {
-    /// Cardboard, air ducts, paint: most of the light comes back.
-    Plain,
-    /// Black tubes: the laser loses them at a distance and at an angle.
-    Black,
-}
-
-impl Surface {
-    /// Share of the light that comes back diffusely, at the laser's 905 nm.
-    pub fn reflectance(self) -> f64 {
-        match self {
-            Self::Plain => 0.7,
-            Self::Black => 0.02,
-        }
-    }
-}
-
-/// A polyline of wall.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Wall {
-    /// What it is made of.
-    pub surface: Surface,
-    /// Vertices in `map` [m]; repeat the first one to close it.
-    pub points: Vec<[f64; 2]>,
-}
-
-/// Where a ray meets a surface.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hit {
-    /// Distance along the ray [m].
-    pub range: f64,
-    /// Cosine of the angle between the ray and the surface's normal, in [0, 1].
-    pub incidence: f64,
-    /// What was hit.
-    pub surface: Surface,
-}
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Segment {
@@ -74,7 +30,7 @@ pub struct Walls {
 }
 
 impl Walls {
-    /// Indexes walls; points that are not finite are left out.
+    /// Indexes walls. Segments with points that are not finite are left out.
     pub fn new(walls: Vec<Wall>) -> Self {
         let segments: Vec<Segment> = walls
             .iter()
@@ -132,8 +88,8 @@ impl Walls {
         }
     }
 
-    /// Walls where a map says they are, for tracks of which only the map is known: the contours between its free
-    /// cells and all others, smoothed over a cell or two.
+    /// The walls of a map, for tracks without measured walls: the contours between free cells and all others, smoothed
+    /// over a cell or two.
     pub fn from_grid(grid: &OccupancyGrid) -> Self {
         Self::new(contours(grid))
     }
@@ -156,7 +112,7 @@ impl Walls {
                     best = Some((range, i));
                 }
             }
-            // What lies in a later cell is further away than this cell's far side.
+            // Everything in a later cell is further away than the far side of this one.
             limit > exit
         });
         best.map(|(range, i)| {
@@ -204,7 +160,7 @@ impl Walls {
             (origin[0] - self.corner[0]) / CELL,
             (origin[1] - self.corner[1]) / CELL,
         ];
-        // Also false for NaN: a car off the index, or lost in space, sees nothing.
+        // Also false for NaN. Outside the index there are no walls.
         if !(at[0] >= 0.0 && at[1] >= 0.0 && at[0] < self.columns as f64 && at[1] < self.rows as f64) {
             return;
         }
@@ -244,81 +200,9 @@ impl Walls {
             }
         }
     }
-
-    /// The walls as CSV: a number for each wall, its surface, and its points in order.
-    pub fn to_csv(&self) -> String {
-        let mut csv = String::from("# wall; surface; x_m; y_m\n");
-        for (i, wall) in self.polylines.iter().enumerate() {
-            let surface = match wall.surface {
-                Surface::Plain => "plain",
-                Surface::Black => "black",
-            };
-            for [x, y] in &wall.points {
-                writeln!(csv, "{i}; {surface}; {x:.3}; {y:.3}").expect("a string takes all");
-            }
-        }
-        csv
-    }
-
-    /// Reads what [`Walls::to_csv`] writes; `file` names it in errors.
-    pub fn parse(file: &str, csv: &str) -> Result<Self, MapError> {
-        let mut walls: Vec<Wall> = Vec::new();
-        let mut current = None;
-        let mut first = None;
-        for (line, text) in (1..).zip(csv.lines()) {
-            let text = text.trim();
-            if text.is_empty() || text.starts_with('#') {
-                continue;
-            }
-            let fault = |fault: String| MapError::Line {
-                file: file.to_owned(),
-                line,
-                fault,
-            };
-            let fields: Vec<&str> = text.split(';').map(str::trim).collect();
-            let &[number, surface, x, y] = fields.as_slice() else {
-                return Err(fault(format!(
-                    "{} fields where wall; surface; x_m; y_m should be",
-                    fields.len()
-                )));
-            };
-            let surface = match surface {
-                "plain" => Surface::Plain,
-                "black" => Surface::Black,
-                other => return Err(fault(format!("surface: {other:?} should be plain or black"))),
-            };
-            let coordinate = |name: &str, field: &str| match field.parse() {
-                Ok(value) if f64::is_finite(value) => Ok(value),
-                _ => Err(fault(format!("{name}: {field:?} is not a finite number"))),
-            };
-            let point = [coordinate("x_m", x)?, coordinate("y_m", y)?];
-            if point.iter().any(|v| v.abs() > 1e4) {
-                return Err(fault(format!("{point:?} is more than 10 km away")));
-            }
-            // The index is a table over all the walls' ground.
-            let [x0, y0] = *first.get_or_insert(point);
-            if (point[0] - x0).abs() > MOST || (point[1] - y0).abs() > MOST {
-                return Err(fault(format!(
-                    "{point:?} is more than {MOST} m away from the first point"
-                )));
-            }
-            let number = number.to_owned();
-            match walls.last_mut() {
-                Some(wall) if current.as_ref() == Some(&number) => wall.points.push(point),
-                _ => {
-                    walls.push(Wall {
-                        surface,
-                        points: vec![point],
-                    });
-                    current = Some(number);
-                }
-            }
-        }
-        Ok(Self::new(walls))
-    }
 }
 
-/// Whether a segment may pass through the index cell around `centre`: exact but for a hair's breadth.
+/// True if a segment may pass through the index cell around `centre`: exact to within a nanometre.
 fn passes(s: &Segment, centre: [f64; 2]) -> bool {
     let [dx, dy] = s.along;
     let offset = dx * (centre[1] - s.from[1]) - dy * (centre[0] - s.from[0]);
@@ -356,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn a_room_is_as_wide_as_it_is() {
+    fn rays_measure_a_room() {
         let walls = Walls::new(vec![square(2.0)]);
         let hit = walls.cast([0.5, 0.0], [1.0, 0.0], 30.0).expect("a wall");
         assert!((hit.range - 1.5).abs() < 1e-12);
@@ -370,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn an_outline_touches_what_it_crosses() {
+    fn an_outline_touches_the_wall_that_it_crosses() {
         let walls = Walls::new(vec![square(2.0)]);
         let at = |x: f64| [[x - 0.1, -0.1], [x + 0.1, -0.1], [x + 0.1, 0.1], [x - 0.1, 0.1]];
         assert_eq!(walls.touching(&at(1.8)), None);
@@ -379,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_s_walls_stand_where_its_cells_change() {
+    fn walls_of_a_map_are_its_contours() {
         // A free room of 2 m x 1 m in a map of 5 cm cells.
         let (width, height) = (60, 40);
         let cells = (0..width * height)
@@ -406,33 +290,6 @@ mod tests {
                 "{direction:?}: {}",
                 hit.range
             );
-        }
-    }
-
-    #[test]
-    fn csv_reads_back_and_faults_name_the_line() {
-        let walls = Walls::new(vec![
-            square(2.0),
-            Wall {
-                surface: Surface::Black,
-                points: vec![[0.0, 0.0], [1.0, 0.0]],
-            },
-        ]);
-        assert_eq!(
-            Walls::parse("walls.csv", &walls.to_csv()).expect("just written"),
-            walls
-        );
-        for (text, expected) in [
-            ("0; plain; 1", "walls.csv, line 1: 3 fields"),
-            ("#\n0; glass; 1; 2", "walls.csv, line 2: surface: \"glass\""),
-            ("0; plain; 1; inf", "walls.csv, line 1: y_m: \"inf\""),
-            (
-                "0; plain; 1e9; 0",
-                "walls.csv, line 1: [1000000000.0, 0.0] is more",
-            ),
-        ] {
-            let error = Walls::parse("walls.csv", text).expect_err("a fault").to_string();
-            assert!(error.starts_with(expected), "{error}");
         }
     }
 

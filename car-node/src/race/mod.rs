@@ -263,7 +263,7 @@ impl Crew {
                 None
             }
             Message::Placed(pose) => {
-                // The crew tells the localizer where the marshals put the car.
+                // The localizer gets the pose at which the recovery crew put the car.
                 match &mut self.guide {
                     RunningGuide::SynPf(localizer, monitor) => {
                         localizer.initialize(*pose).ok();

@@ -1,4 +1,4 @@
-//! The map that SLAM would make of the walls, with the defects that come with it.
+//! The map that SLAM would draw of the walls, with its errors.
 
 use std::f64::consts::TAU;
 
@@ -17,15 +17,15 @@ use crate::{LidarParams, Walls};
 pub struct MappingParams {
     /// Edge of a cell [m].
     pub resolution: f64,
-    /// Error of the mapping run's poses that is left after closing the loop: standard deviation [m].
+    /// Standard deviation of the mapping run's position error after closing the loop [m].
     pub drift: f64,
-    /// The same of the heading [rad].
+    /// Standard deviation of its heading error [rad].
     pub heading_drift: f64,
-    /// Beams that end in a cell over beams that pass or end in it, from which on it is a wall. One half is the most
-    /// likely map (Hahnel et al., 2003). `gmapping` takes 0.25, Karto and `slam_toolbox` 0.1: they draw every cell that
-    /// noise reaches, so that walls stand some 3 cm too close.
+    /// Least share of beams that end in an occupied cell, of all beams that end in it or pass it. One half is the most
+    /// likely map (Hahnel et al., 2003). `gmapping` uses 0.25, Karto and `slam_toolbox` 0.1: they draw every cell that
+    /// noise reaches, so their walls stand about 3 cm too close.
     pub occupied_share: f64,
-    /// Distance between the poses that scan [m].
+    /// Distance between the poses of the scans [m].
     pub step: f64,
 }
 
@@ -41,13 +41,13 @@ impl Default for MappingParams {
     }
 }
 
-/// Beams further than this are not entered, as mappers do it [m].
+/// Longer beams are not used, as in common mappers [m].
 const REACH: f64 = 12.0;
 /// Free border around the walls [m].
 const BORDER: f64 = 0.5;
 
-/// Maps the walls by driving once along `path` with a noisy laser, walking pace, and counting for every cell how many
-/// beams end in it and how many pass (Hahnel et al., 2003: reflection probability maps). What no beam saw is unknown.
+/// Maps the walls from one slow drive along `path` with a noisy laser. Counts for every cell the beams that end in it and
+/// those that pass (reflection probability maps; Hahnel et al., 2003). Cells that no beam reaches are unknown.
 pub fn draw_map(path: &[[f64; 2]], walls: &Walls, params: &MappingParams, seed: u64) -> OccupancyGrid {
     let mut rng = StdRng::seed_from_u64(seed ^ 0x6d61_7070);
     let lidar = LidarParams::default();
@@ -71,7 +71,7 @@ pub fn draw_map(path: &[[f64; 2]], walls: &Walls, params: &MappingParams, seed: 
         if travelled >= next {
             next += params.step;
             let truth = Pose::new(x, y, (-left[i][0]).atan2(left[i][1]));
-            // The mapper's idea of the pose is off, slowly changing along the lap.
+            // The mapper's pose error changes slowly along the lap.
             let believed = Pose::new(
                 truth.x + params.drift * drift[0].at(lap),
                 truth.y + params.drift * drift[1].at(lap),
@@ -114,7 +114,7 @@ pub fn draw_map(path: &[[f64; 2]], walls: &Walls, params: &MappingParams, seed: 
     OccupancyGrid::new(width, height, params.resolution, origin, cells)
 }
 
-/// One beam of the mapping run [m]; None where nothing comes back.
+/// Range of one beam of the mapping run [m]; None without a return.
 fn measure(rng: &mut StdRng, lidar: &LidarParams, pose: Pose, angle: f64, walls: &Walls) -> Option<f64> {
     let jitter: f64 = StandardNormal.sample(rng);
     let noise: f64 = StandardNormal.sample(rng);
@@ -139,7 +139,7 @@ fn enter(
     };
     let at = |t: f64| index([from[0] + t * direction[0], from[1] + t * direction[1]]);
     let end = at(range);
-    // Half a cell at a time visits every cell that matters; twice in a row counts once.
+    // Steps of half a cell visit every cell that matters. A cell visited twice in a row counts once.
     let mut last = end;
     for step in 0..(2.0 * range) as usize {
         let here = at(step as f64 / 2.0);
@@ -218,7 +218,7 @@ mod tests {
             assert_eq!(grid.at([3.0 * cos, 3.0 * sin]), Cell::Free);
             assert_eq!(grid.at([4.4 * cos, 4.4 * sin]), Cell::Unknown);
             assert_eq!(grid.at([1.5 * cos, 1.5 * sin]), Cell::Unknown);
-            // Somewhere within a cell and a half of the true face there is a wall in the map.
+            // The map has a wall within a cell and a half of the true face.
             for radius in [2.0, 4.0] {
                 let near = (-7..=7).map(|k| radius + 0.01 * f64::from(k));
                 let drawn = near

@@ -1,4 +1,4 @@
-//! The raceline: of all lines between the walls, the one that bends least.
+//! The raceline of minimum curvature between walls.
 
 use maps::{Raceline, RacelineFault};
 
@@ -10,9 +10,9 @@ use crate::Walls;
 const SPACING: f64 = 0.25;
 /// Distance between the points of the finished line [m].
 const FINE: f64 = 0.1;
-/// The line is moved, laid out anew and moved again this often; later rounds change millimetres.
+/// Rounds of optimising and resampling. More rounds change millimetres.
 const ROUNDS: usize = 6;
-/// How far a wall may be away and still matter [m].
+/// Walls further away than this are ignored [m].
 const REACH: f64 = 5.0;
 
 /// Why no raceline was found.
@@ -32,17 +32,17 @@ pub enum LineError {
         /// Twice the margin [m].
         needed: f64,
     },
-    /// The points are no closed line.
+    /// The points make no closed line.
     #[error(transparent)]
     Line(#[from] RacelineFault),
 }
 
-/// The closed line of least squared curvature that keeps `margin` [m] from all walls, found from a line that lies between
-/// them; driven at 1 m/s for now.
+/// The closed line of least squared curvature that keeps `margin` [m] from all walls, found from a line between them. Its
+/// speed is 1 m/s.
 ///
 /// Heilmeier et al., *Minimum curvature trajectory planning and control for an autonomous race car*, 2019: each point
 /// moves along its normal, curvature is linear in the moves, and the quadratic programme with bounds is solved again
-/// around the line it gave. We solve it by projected Newton steps (Bertsekas, 1982).
+/// around its result. It is solved by projected Newton steps (Bertsekas, 1982).
 pub fn minimum_curvature(start: &[[f64; 2]], walls: &Walls, margin: f64) -> Result<Raceline, LineError> {
     let mut points = resample(start, SPACING);
     for _ in 0..ROUNDS {
@@ -75,7 +75,7 @@ fn room(
     let raw: Vec<[f64; 2]> = (0..n).map(|i| [reach(i, -1.0), reach(i, 1.0)]).collect();
     (0..n)
         .map(|i| {
-            // A post between two points, or just beside one, must be kept away from as well.
+            // Posts between two points count, too.
             let nearby = [n - 2, n - 1, 0, 1, 2].map(|k| raw[(i + k) % n]);
             let least = |side: usize| nearby.iter().map(|room| room[side]).fold(REACH, f64::min);
             let [right, left] = [least(0), least(1)];
@@ -87,7 +87,7 @@ fn room(
                     needed: 2.0 * margin,
                 });
             }
-            // Where the line is too close already, it has to move away.
+            // A line that is too close already has to move away.
             Ok([
                 (margin - right).min(left - margin),
                 (left - margin).max(margin - right),
@@ -96,7 +96,7 @@ fn room(
         .collect()
 }
 
-/// The moves that make the sum of squared curvatures least.
+/// The moves that minimise the sum of squared curvatures.
 fn solve(points: &[[f64; 2]], normals: &[[f64; 2]], bounds: &[[f64; 2]]) -> Vec<f64> {
     let n = points.len();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
@@ -127,7 +127,7 @@ fn solve(points: &[[f64; 2]], normals: &[[f64; 2]], bounds: &[[f64; 2]]) -> Vec<
             .zip(&linear)
             .map(|(a, b)| a + b)
             .collect();
-        // Points held by a wall that they press against stay; all others take a Newton step.
+        // Points at a bound that the gradient pushes against stay. All others take a Newton step.
         let held: Vec<bool> = (0..n)
             .map(|i| {
                 moves[i] <= bounds[i][0] && gradient[i] > 0.0 || moves[i] >= bounds[i][1] && gradient[i] < 0.0
@@ -187,7 +187,7 @@ mod tests {
             .iter()
             .map(|p| p.curvature.abs())
             .fold(0.0, f64::max);
-        // Between the walls fits no rounder end than a half circle of 2.6 m: a line that uses the room gets close to it.
+        // The roundest end that fits between the walls is a half circle of 2.6 m. The line comes close to it.
         assert!(sharpest < 0.75, "{sharpest}");
         for p in line.points() {
             for i in 0..36 {

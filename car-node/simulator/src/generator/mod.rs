@@ -1,5 +1,6 @@
-//! Tracks of our own: walls from a centre line, a raceline between them, and the map that SLAM would make of them.
+//! Generated tracks: walls from a centre line, a raceline between them, and the map that SLAM would draw of them.
 
+mod generate;
 mod mapping;
 mod minimum_curvature;
 mod random;
@@ -10,5 +11,5 @@ mod spline;
 
 pub use mapping::{MappingParams, draw_map};
 pub use minimum_curvature::{LineError, minimum_curvature};
-pub use spec::{BUNDLED, BlackStretch, Block, TrackSpec};
+pub use spec::{BlackStretch, Block, TrackSpec};
 pub use speed_profile::{SpeedParams, slowed_to, speed_profile};

@@ -1,4 +1,4 @@
-//! Tracks nobody drew.
+//! Random tracks.
 
 use std::f64::consts::TAU;
 
@@ -8,19 +8,19 @@ use rand::{RngExt, SeedableRng};
 use super::spline::{closed_curve, distance};
 use super::{MappingParams, SpeedParams, TrackSpec};
 
-/// Tries until a random line is one that a track fits around; what comes after is the last try.
+/// Most tries to find a random line with room for a track.
 const TRIES: u64 = 1000;
-/// Distance between the points at which a line is judged [m].
+/// Distance between the points at which a line is checked [m].
 const SPACING: f64 = 0.25;
 
 impl TrackSpec {
     /// A random track: about `length` [m] a lap, `width` [m] wide.
     ///
-    /// The centre line winds around a ring; lines that bend too sharply for their width, or come too close to themselves,
-    /// are thrown away. Long and narrow tracks wind more.
+    /// The centre line winds around a ring. Lines that bend too sharply for their width or come too close to themselves are
+    /// rejected. Long and narrow tracks wind more.
     pub fn random(seed: u64, length: f64, width: f64) -> Self {
         let half_width = width / 2.0;
-        // The more room there is, the wilder it may get; after many failures, the tamer it must.
+        // More room allows more winding; after many failures the line winds less.
         let mut centre = Vec::new();
         for attempt in 0..TRIES {
             let wildness = 0.55 * (1.0 - attempt as f64 / TRIES as f64);
@@ -29,7 +29,7 @@ impl TrackSpec {
                 break;
             }
         }
-        // Three decimals read well in a file, and are the track that the file makes.
+        // Rounded to three decimals, as the file is written, so that the file makes the same track.
         let centre = centre
             .into_iter()
             .map(|p| p.map(|v| (v * 1000.0).round() / 1000.0))
@@ -51,7 +51,7 @@ impl TrackSpec {
     }
 }
 
-/// Control points around a ring whose radius wanders by the share `wildness`, scaled to the length.
+/// Control points around a ring whose radius varies by the share `wildness`, scaled to the length.
 fn ring(seed: u64, length: f64, wildness: f64) -> Vec<[f64; 2]> {
     let mut rng = StdRng::seed_from_u64(seed);
     let count = (length / 4.0).clamp(8.0, 40.0).round() as usize;
@@ -73,7 +73,7 @@ fn ring(seed: u64, length: f64, wildness: f64) -> Vec<[f64; 2]> {
         .collect()
 }
 
-/// Whether walls fit beside the line: it bends no sharper than they need, and keeps away from itself.
+/// True if walls fit beside the line: it bends gently enough and keeps away from itself.
 fn fits(curve: &[[f64; 2]], half_width: f64) -> bool {
     let n = curve.len();
     let wall = 2.0 * half_width + 0.3;

@@ -1,6 +1,6 @@
-//! Symmetric equations around a closed line, in which each unknown meets the two on either side of it.
+//! Symmetric linear equations around a closed line. Each unknown is coupled with the two on either side of it.
 
-/// Fewest unknowns: with less, the one two places on is also the one two places back.
+/// Fewest unknowns. With fewer, the neighbours on both sides would be the same.
 pub(crate) const LEAST: usize = 5;
 
 /// A symmetric matrix with two diagonals on either side of the main one, closed to a ring.
@@ -44,12 +44,11 @@ impl Ring {
             .collect()
     }
 
-    /// Solves for the unknowns that are not `held`; those that are come out as zero. None unless the matrix is positive
-    /// definite.
+    /// Solves for the unknowns that are not `held`; held ones are zero. None unless the matrix is positive definite.
     ///
-    /// The last two unknowns close the ring. Without them the matrix is a band, whose Cholesky factor is one as well; they
-    /// follow from its Schur complement (Golub and Van Loan, *Matrix Computations*, sections 4.3 and 3.2): as many
-    /// steps as unknowns.
+    /// The last two unknowns close the ring. Without them the matrix is banded, and so is its Cholesky factor. The two
+    /// follow from the Schur complement (Golub and Van Loan, *Matrix Computations*, sections 4.3 and 3.2). The number of
+    /// steps grows with the number of unknowns.
     pub(crate) fn solve(&self, right: &[f64], held: &[bool]) -> Option<Vec<f64>> {
         let n = self.rows.len();
         let m = n - 2;

@@ -1,9 +1,9 @@
-//! How fast a line can be driven.
+//! The speeds of a raceline, from limits on acceleration.
 
 use maps::{Raceline, RacelinePoint};
 use serde::{Deserialize, Serialize};
 
-/// What the car is asked for, well inside of what it can do.
+/// Limits of acceleration and speed, well below those of the car.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpeedParams {
@@ -18,8 +18,8 @@ pub struct SpeedParams {
 }
 
 impl Default for SpeedParams {
-    /// Within the grip of taped tyres (19 N at 3.5 kg are 5.4 m/s^2), so that both rows of the paper's table are driven to
-    /// the same profile, as they were there.
+    /// Within the grip of taped tyres (19 N at 3.5 kg are 5.4 m/s^2), so that both rows of the paper's table can use the
+    /// same profile, as in the paper.
     fn default() -> Self {
         Self {
             lateral: 4.8,
@@ -30,13 +30,13 @@ impl Default for SpeedParams {
     }
 }
 
-/// The line with the speeds of a car that uses the acceleration it may, in every direction together (an ellipse): as fast
-/// as curvature allows, then a sweep backwards for braking and one forwards for driving (Subosits and Gerdes, 2015).
+/// The line with the highest speeds within the limits, which form an ellipse of longitudinal and lateral acceleration:
+/// first by curvature, then a pass backwards for braking and one forwards for driving (Subosits and Gerdes, 2015).
 pub fn speed_profile(line: &Raceline, params: &SpeedParams) -> Raceline {
     fastest(line, params, |_| params.top)
 }
 
-/// The same for a line that was made for another car: nowhere faster than the line's own speeds either.
+/// The same for a line that was made for another car. Nowhere faster than the line's own speeds.
 pub fn slowed_to(line: &Raceline, params: &SpeedParams) -> Raceline {
     fastest(line, params, |p| p.speed.min(params.top))
 }
@@ -60,7 +60,7 @@ fn fastest(line: &Raceline, params: &SpeedParams, most: impl Fn(&RacelinePoint) 
         let lateral = p.speed * p.speed * p.curvature / params.lateral;
         (1.0 - lateral * lateral).max(0.0).sqrt()
     };
-    // Twice round, so that the start line is an ordinary place.
+    // Two laps, so that the start line is no special place.
     for i in (0..2 * n).rev() {
         let (here, next) = (i % n, (i + 1) % n);
         let gain = 2.0 * params.brake * left(&points[next]) * gaps[here];
@@ -74,7 +74,7 @@ fn fastest(line: &Raceline, params: &SpeedParams, most: impl Fn(&RacelinePoint) 
     Raceline::new(points).expect("the same line with other speeds")
 }
 
-/// Time for a lap at the line's own speeds [s].
+/// Time of a lap at the line's own speeds [s].
 #[cfg(test)]
 fn lap_time(line: &Raceline) -> f64 {
     let points = line.points();

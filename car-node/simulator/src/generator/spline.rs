@@ -7,13 +7,13 @@ use super::ring::Ring;
 /// Points between two control points before resampling.
 const STEPS: usize = 100;
 
-/// A closed Catmull-Rom curve (centripetal: Yuksel et al., 2011, no cusps and no loops) through control points, resampled
-/// to points about `spacing` [m] apart.
+/// A closed Catmull-Rom curve through control points, resampled to points about `spacing` [m] apart. The centripetal form
+/// has no cusps and no loops (Yuksel et al., 2011).
 pub(crate) fn closed_curve(control: &[[f64; 2]], spacing: f64) -> Vec<[f64; 2]> {
     curve_and_knots(control, spacing).0
 }
 
-/// A closed curve, and which of its points lies at which control point.
+/// A closed curve, and for each control point the index of its point on the curve.
 pub(crate) fn curve_and_knots(control: &[[f64; 2]], spacing: f64) -> (Vec<[f64; 2]>, Vec<usize>) {
     let n = control.len();
     let mut fine = Vec::new();
@@ -35,7 +35,8 @@ pub(crate) fn curve_and_knots(control: &[[f64; 2]], spacing: f64) -> (Vec<[f64; 
     (curve, knots)
 }
 
-/// A closed polyline's points moved to equal distances of about `spacing` [m]; at least as many as make a [`Ring`].
+/// A closed polyline resampled at equal distances of about `spacing` [m], with at least as many points as a [`Ring`]
+/// needs.
 pub(crate) fn resample(points: &[[f64; 2]], spacing: f64) -> Vec<[f64; 2]> {
     let n = points.len();
     let lengths: Vec<f64> = (0..n).map(|i| distance(points[i], points[(i + 1) % n])).collect();

@@ -268,9 +268,9 @@ fn a_set_put_on_the_car_survives_a_restart() {
         let (_, event) = next::<Event>(&events, |event| matches!(event.kind, EventKind::SetStored { .. }));
         assert_eq!(event.kind.to_string(), expected);
     };
-    stored("set mine stored, as hq but for max_particles 1500 -> 1400");
+    stored("set mine stored from hq with max_particles 1500 -> 1400");
     wall.command(&car, 20, None, put("mine", Value::Int(1300)));
-    stored("set mine stored in place of what it was: max_particles 1400 -> 1300");
+    stored("set mine replaced: max_particles 1400 -> 1300");
     let answer = wall.command(&car, 21, None, put("mine", Value::Int(1500)));
     // The same command again is answered again; another one under its id is refused.
     assert_eq!(

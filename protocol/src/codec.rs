@@ -1,8 +1,8 @@
-//! Messages to bytes and back. The only file that names the serializer.
+//! Messages to bytes and back. No other file names the serializer.
 //!
 //! Payloads are bincode 2 with fixed-size little-endian integers: a list's length is a `u64`, an enum's variant a
-//! `u32`, and a number takes what its type takes. bincode has no maintainer any more; swapping it means this file
-//! and new golden bytes.
+//! `u32`, and a number takes what its type takes. bincode is no longer maintained; replacing it
+//! changes this file and the golden bytes.
 
 use serde::de::DeserializeOwned;
 
@@ -18,7 +18,7 @@ const CONFIG: Configuration<LittleEndian, Fixint, Limit<LIMIT>> = bincode::confi
     .with_fixed_int_encoding()
     .with_limit::<LIMIT>();
 
-/// Checks a message and writes it behind its header.
+/// Checks a message and writes its header and payload.
 pub fn encode<M: Message>(message: &M, stamps: Stamps) -> Result<Vec<u8>, CodecError> {
     check(message)?;
     let mut bytes = Header::new(M::SCHEMA, M::VERSION, stamps).to_bytes().to_vec();
@@ -28,8 +28,8 @@ pub fn encode<M: Message>(message: &M, stamps: Stamps) -> Result<Vec<u8>, CodecE
     Ok(bytes)
 }
 
-/// Reads a message: the whole of `bytes`, every value checked. One of an older version comes as the present one; the header
-/// says which it was.
+/// Reads a message and checks every value. All of `bytes` must belong to it. A message of an older version is converted
+/// to the present one; the header keeps the older version's number.
 pub fn decode<M: Message>(bytes: &[u8]) -> Result<(Header, M), CodecError> {
     let header = Header::read(bytes)?;
     if header.schema != M::SCHEMA {
@@ -53,12 +53,12 @@ pub fn decode<M: Message>(bytes: &[u8]) -> Result<(Header, M), CodecError> {
     Ok((header, message))
 }
 
-/// What follows a header.
+/// The bytes behind a header.
 #[derive(Debug, Clone, Copy)]
 pub struct Payload<'a>(&'a [u8]);
 
 impl Payload<'_> {
-    /// The whole of it as a `T`.
+    /// Reads all of it as a `T`.
     pub fn read<T: DeserializeOwned>(&self) -> Result<T, CodecError> {
         let (value, consumed) = bincode::serde::decode_from_slice::<T, _>(self.0, CONFIG)
             .map_err(|e| CodecError::Payload(e.to_string()))?;
@@ -72,7 +72,7 @@ impl Payload<'_> {
         }
     }
 
-    /// The number of the variant, of a payload that begins with an enum.
+    /// The variant's number in a payload that begins with an enum.
     pub fn variant(&self) -> Option<u32> {
         self.0.first_chunk().map(|tag| u32::from_le_bytes(*tag))
     }
@@ -96,25 +96,25 @@ fn check<M: Message>(message: &M) -> Result<(), CodecError> {
 /// Why bytes are not a message, or a message cannot be sent.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CodecError {
-    /// The header is missing or not ours.
+    /// The header is missing or belongs to another protocol.
     #[error(transparent)]
     Header(#[from] HeaderError),
-    /// Another message than the key promises.
+    /// A message of another type than expected.
     #[error("the message is a {got:?}, not a {expected:?}")]
     Schema {
-        /// What it says it is.
+        /// The type in its header.
         got: crate::Schema,
-        /// What was asked for.
+        /// The type expected.
         expected: crate::Schema,
     },
-    /// A layout of another version.
+    /// A version that this program does not know.
     #[error("{schema:?} has version {got}, this program reads version {known}: update the older side")]
     Version {
         /// The message.
         schema: crate::Schema,
         /// Its version.
         got: u16,
-        /// Ours.
+        /// The version that this program knows.
         known: u16,
     },
     /// Longer than this message may be.
@@ -125,7 +125,7 @@ pub enum CodecError {
         /// Limit [bytes].
         max: usize,
     },
-    /// The payload is cut off, or no value of its type.
+    /// The payload is cut off or malformed.
     #[error("malformed payload: {0}")]
     Payload(String),
     /// Bytes are left over.
@@ -133,10 +133,10 @@ pub enum CodecError {
     Trailing {
         /// Bytes that the message took.
         consumed: usize,
-        /// Bytes there are.
+        /// Bytes of the payload.
         len: usize,
     },
-    /// A value that may not be.
+    /// A value outside its rules.
     #[error("invalid value: {0}")]
     Invalid(#[from] Invalid),
 }

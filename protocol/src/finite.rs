@@ -1,4 +1,4 @@
-//! Finds a NaN or an infinity anywhere in a message: a serializer that writes nothing and stops at the first one.
+//! Finds a NaN or an infinity anywhere in a message, with a serializer that writes nothing and stops at the first one.
 
 use std::fmt;
 
@@ -6,7 +6,7 @@ use serde::{Serialize, ser};
 
 use crate::Invalid;
 
-/// Refuses a message that holds a float which is no number.
+/// Refuses a message with a float that is not finite.
 pub(crate) fn check(message: &impl Serialize) -> Result<(), Invalid> {
     message.serialize(&mut Walker { field: "value" }).map_err(|e| e.0)
 }

@@ -1,4 +1,4 @@
-//! Poses and velocities in the plane, as they travel.
+//! Poses and velocities in the plane, as messages hold them.
 
 use serde::{Deserialize, Serialize};
 

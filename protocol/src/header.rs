@@ -11,15 +11,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::Schema;
 
-/// What a sender says of each message beside its content.
+/// What a sender adds to the content of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Stamps {
     /// Identifies a run: the life of one sending process. It is the unix time of the process's start \[ns\].
     /// Sequence numbers start again at 1 with each run.
     pub run_id: u64,
-    /// Counts the messages of this sender on this key, from 1. 0 where nothing is counted (questions, commands).
+    /// Number of the message within the run and its key, from 1. It is 0 for queries and commands, which are not counted.
     pub sequence: u64,
-    /// When the content was true: the sensor's stamp [unix ns].
+    /// The time that the content describes: the sensor's stamp [unix ns].
     pub sensor: i64,
     /// When the message was handed to the network [unix ns].
     pub published: i64,
@@ -101,7 +101,7 @@ impl Header {
     }
 }
 
-/// Bytes that do not start with a header of ours.
+/// Bytes that do not start with a header of this protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum HeaderError {
     /// Too short to hold a header.

@@ -59,7 +59,7 @@ impl From<CarName> for String {
     }
 }
 
-/// What a key is about.
+/// The last part of a key: what its messages hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
@@ -89,11 +89,11 @@ pub enum Topic {
     RecordedScan,
     /// [`Truth`](crate::Truth), from simulators and bags that have it, recovered.
     RecordedTruth,
-    /// Question: [`MapReply`](crate::MapReply).
+    /// Query, answered with a [`MapReply`](crate::MapReply).
     Map,
-    /// Question: [`CarInfo`](crate::CarInfo).
+    /// Query, answered with a [`CarInfo`](crate::CarInfo).
     Info,
-    /// Question with a [`ClockRequest`](crate::ClockRequest): [`ClockReply`](crate::ClockReply).
+    /// Query with a [`ClockRequest`](crate::ClockRequest), answered with a [`ClockReply`](crate::ClockReply).
     Clock,
     /// [`Command`](crate::Command) about parameter sets.
     CmdParams,
@@ -109,7 +109,7 @@ pub enum Topic {
     Shadow,
     /// [`LinkReport`](crate::LinkReport), put by the pit wall.
     Link,
-    /// Question with a [`MissingRequest`](crate::MissingRequest): [`MissingReply`](crate::MissingReply).
+    /// Query with a [`MissingRequest`](crate::MissingRequest), answered with a [`MissingReply`](crate::MissingReply).
     Missing,
 }
 
@@ -160,7 +160,7 @@ impl Topic {
         format!("{}/*/{}", Key::PREFIX, self.as_str())
     }
 
-    /// True for the streams that a recorder takes in whole and a car keeps ready to send again.
+    /// True for the full-rate streams that a recorder takes without gaps.
     pub fn recorded(self) -> bool {
         matches!(
             self,
@@ -172,7 +172,7 @@ impl Topic {
         )
     }
 
-    /// True for topics whose gaps the receiver has filled by the sender, which keeps them for a while.
+    /// True for topics whose lost messages the receiver requests again. The sender keeps them for a while.
     pub fn recovered(self) -> bool {
         self.recorded() || matches!(self, Self::Health | Self::Event)
     }
@@ -205,7 +205,7 @@ pub struct Key {
 }
 
 impl Key {
-    /// What all keys start with.
+    /// The first two parts of every key.
     pub const PREFIX: &'static str = "synpf/v1";
 
     /// The key of a car's topic.
@@ -233,7 +233,7 @@ impl FromStr for Key {
     }
 }
 
-/// A key that is none of ours.
+/// A key that does not belong to this protocol.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeyError {
     /// Not of the form `synpf/v1/<car>/<topic>`.

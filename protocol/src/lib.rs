@@ -1,25 +1,29 @@
-//! What crosses the network between the cars and the pit wall.
+//! The messages between the cars and the pit wall: their types, their keys and their bytes.
+//!
+//! The crate encodes, decodes and validates messages. It never opens a socket or a file and never reads a clock, and
+//! it depends on neither zenoh nor tokio.
 //!
 //! ```text
-//! car  --- pose, cloud, scan, health, load, params, shadow, event, recorded/* --->  pit wall      (telemetry)
-//! car  <-- map?, info?, clock?, missing? --------------------------------  pit wall      (questions)
-//! car  <-- cmd/params, cmd/pose, cmd/relocalize, cmd/rates, cmd/auto ----  pit wall      (commands)
-//!      --- answer: done at update N | refused | stale revision ---------->
-//! car  <-- link (how late its poses arrive) -----------------------------  pit wall
+//! car  --- pose, cloud, scan, health, load, params, shadow, event, recorded/* -->  pit wall   (telemetry)
+//! car  <-- map?, info?, clock?, missing? ----------------------------------------  pit wall   (queries)
+//! car  <-- cmd/params, cmd/pose, cmd/relocalize, cmd/rates, cmd/auto ------------  pit wall   (commands)
+//!      --- answer: done at update N | refused | stale revision ----------------->
+//! car  <-- link (how late its poses arrive) -------------------------------------  pit wall   (link report)
 //! ```
 //!
-//! Each message travels under the key `synpf/v1/<car>/<topic>` ([`Key`]) as a fixed [`Header`] followed by its
-//! payload ([`encode`], [`decode`]). This crate holds no socket, no file and no clock.
+//! Each message travels under the key `synpf/v1/<car>/<topic>` ([`Key`]). It is a fixed [`Header`] followed by a
+//! payload ([`encode`], [`decode`]).
 //!
 //! # Compatibility
-//! - A change of a message's layout is a new version of it: the old struct stays, frozen, and is converted.
+//! - A change of a message's layout is a new version of the message. The old struct stays unchanged, and what it
+//!   holds is converted.
 //! - Enum variants are appended, never reordered or removed: their order is on the wire.
-//! - An unknown version, topic or variant is an error that says so; the receiver counts it and carries on.
-//! - The golden bytes in `tests/golden.rs` hold all of this in place.
+//! - An unknown version, topic or variant is an error. The receiver counts it and goes on.
+//! - Golden bytes in `tests/wire/golden.rs` fail when the layout of a message changes.
 //!
 //! # Numbers
-//! No float on the wire is NaN or infinite: both [`encode`] and [`decode`] refuse one, naming its field. What
-//! may be unknown is an `Option`.
+//! No float on the wire is NaN or infinite. [`encode`] and [`decode`] refuse one and name its field. A value that may
+//! be unknown is an `Option`.
 //!
 //! ```
 //! use protocol::{CarName, Key, Pose2, Stamps, Topic, Truth, Twist2, decode, encode};

@@ -1,4 +1,4 @@
-//! What every message has: a schema, a version, a size limit and its own rules.
+//! The trait of all messages: a schema, a version, a size limit and rules for the values.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -7,20 +7,20 @@ use crate::codec::{CodecError, Payload};
 
 /// A payload that can travel behind a [`Header`](crate::Header).
 pub trait Message: Serialize + DeserializeOwned {
-    /// What it is.
+    /// The type of the payload.
     const SCHEMA: Schema;
     /// Version of its layout.
     const VERSION: u16 = 1;
     /// Longest payload [bytes].
     const MAX_LEN: usize = 64 * 1024;
 
-    /// Reads a payload of an older version as the present one; None for a version that never was.
+    /// Converts a payload of an older version to the present one. None for a version that never existed.
     fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
         let _ = (version, payload);
         None
     }
 
-    /// Rules beyond the types: lengths and ranges. That floats are finite is checked for all messages.
+    /// Checks lengths and ranges. [`encode`](crate::encode) and [`decode`](crate::decode) check that all floats are finite.
     fn validate(&self) -> Result<(), Invalid> {
         Ok(())
     }
@@ -63,7 +63,7 @@ impl Invalid {
 
 macro_rules! schemas {
     ($($(#[$doc:meta])* $name:ident = $id:literal,)*) => {
-        /// What a payload is. The numbers are on the wire: they are never given to something else.
+        /// The type of a payload. The numbers are on the wire, so a number is never reused.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
         #[repr(u16)]
         pub enum Schema { $($(#[$doc])* $name = $id,)* }

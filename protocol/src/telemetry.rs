@@ -1,11 +1,11 @@
-//! Everything that a car says of itself, as one type.
+//! Every message that a car sends about itself, as one type.
 
 use crate::{
     Cloud, CodecError, Event, Header, Health, Load, Params, Pose, RecordedOdometry, RecordedScan, ScanView,
     Shadow, Topic, Truth, decode,
 };
 
-/// A message from a car, told apart by its topic.
+/// A message from a car. Its topic decides the variant.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Telemetry {
     /// On [`Topic::Pose`] and [`Topic::RecordedPose`].
@@ -33,7 +33,7 @@ pub enum Telemetry {
 }
 
 impl Telemetry {
-    /// Reads what came in on `topic`. None for topics that carry no telemetry.
+    /// Decodes a message that arrived on `topic`. None for topics without telemetry.
     pub fn decode(topic: Topic, bytes: &[u8]) -> Option<Result<(Header, Self), CodecError>> {
         fn with<M: crate::Message>(
             bytes: &[u8],

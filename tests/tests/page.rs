@@ -187,7 +187,7 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
         browser
             .wait(
                 "the log tells who",
-                &said("car-2 set lq (revision 2) in place of hq"),
+                &said("car-2 set lq (revision 2) replaces hq"),
             )
             .await;
         browser.wait("by name", &said("[ana]")).await;

@@ -4,31 +4,31 @@ use serde::{Deserialize, Serialize};
 
 use crate::{CommandId, Message, ParameterSet, Pose2, Rates, Schema, SetRef};
 
-/// What became of a command. No answer at all is an outcome of its own, which the asker sees by the clock.
+/// The answer to a command. If none arrives in time, the sender has to treat that as a fourth outcome.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answer {
     /// The command's id.
     pub id: CommandId,
-    /// What became of it.
+    /// The outcome.
     pub outcome: Outcome,
     /// The set in force after it.
     pub set: SetRef,
 }
 
-/// What became of a command.
+/// The outcome of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// Done.
     Done {
-        /// The first filter update under it; None where the filter was not concerned, or has not run yet.
+        /// The first filter update under it. None where the command does not concern the filter, or the filter has not run.
         update: Option<u64>,
-        /// What was asked for.
+        /// The data requested.
         reply: Reply,
     },
     /// Not done, and nothing has changed.
     Refused {
-        /// Every fault, in words.
+        /// Every reason, in words.
         faults: Vec<String>,
     },
     /// Not done, because the set in force is not at the expected revision.
@@ -40,7 +40,7 @@ pub enum Outcome {
     },
 }
 
-/// What a command asked for.
+/// The data that a command requested.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reply {
@@ -48,7 +48,7 @@ pub enum Reply {
     Nothing,
     /// All sets on the car.
     Sets(Vec<StoredSet>),
-    /// Where the car may be, the best first.
+    /// Possible poses of the car, the best first.
     Candidates(Vec<Candidate>),
     /// The telemetry rates.
     Rates(Rates),
@@ -65,14 +65,14 @@ pub struct StoredSet {
     pub who: Option<String>,
 }
 
-/// A place where the car may be.
+/// A possible pose of the car.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Candidate {
-    /// Tells it from the others of this search; the best is 1.
+    /// Number within this search; the best has 1.
     pub number: u32,
     /// `map_from_base_link`.
     pub pose: Pose2,
-    /// How likely the last scans are there, per beam, in `[0, 1]`; only good for comparing candidates.
+    /// Likelihood of the last scans at this pose, per beam, in `[0, 1]`. Only differences between candidates mean something.
     pub score: f32,
 }
 

@@ -8,14 +8,14 @@ use serde::{Deserialize, Serialize};
 use crate::to_wall::set_name;
 use crate::{Invalid, Message, ParameterSet, Pose2, Schema, Topic};
 
-/// Something for a car to do, once: sent again with the same id, it gets the same answer and does nothing more.
+/// A command to a car. The car executes it once; sent again with the same id, it only gets the same answer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Command {
-    /// Tells this command from every other.
+    /// Unique id of this command.
     pub id: CommandId,
     /// Who gives it, at most [`Command::MAX_OPERATOR`] bytes.
     pub operator: String,
-    /// Only if the set in force has this revision; None: whatever it has.
+    /// Execute the command only if the set in force has this revision. None: at any revision.
     pub expected_revision: Option<u64>,
     /// What to do.
     pub action: Action,
@@ -26,24 +26,24 @@ impl Command {
     pub const MAX_OPERATOR: usize = 64;
 }
 
-/// What to do. Each goes under a topic of its own, so that a router can tell who may do what.
+/// What to do. Each action has its own topic, so that a router can restrict who may send it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Action {
     /// Under [`Topic::CmdParams`].
     Params(ParamsAction),
-    /// Under [`Topic::CmdPose`]: start again from this `map_from_base_link`, true now.
+    /// Under [`Topic::CmdPose`]: the initial pose `map_from_base_link`, valid now.
     Pose(Pose2),
     /// Under [`Topic::CmdRelocalize`].
     Relocalize(RelocalizeAction),
     /// Under [`Topic::CmdRates`].
     Rates(RatesAction),
-    /// Under [`Topic::CmdAuto`]: let the car switch sets by itself, or not.
+    /// Under [`Topic::CmdAuto`]: turn automatic switching of sets on or off.
     Auto(bool),
 }
 
 impl Action {
-    /// The topic that it goes under.
+    /// The topic under which it is sent.
     pub fn topic(&self) -> Topic {
         match self {
             Self::Params(_) => Topic::CmdParams,
@@ -66,9 +66,9 @@ pub enum ParamsAction {
         /// Fall back by itself after this time unless confirmed [ms].
         revert_after_ms: Option<u32>,
     },
-    /// Store a set on the car, in place of one of the same name if that was put there before, and put it in force.
+    /// Store a set on the car and put it in force. It replaces a stored set of the same name.
     Put {
-        /// The set. Values not given keep what they have in the set in force.
+        /// The set. Values that are not given are taken from the set in force.
         set: ParameterSet,
         /// Fall back by itself after this time unless confirmed [ms].
         revert_after_ms: Option<u32>,
@@ -84,7 +84,7 @@ pub enum ParamsAction {
     },
     /// Answer with all sets.
     List,
-    /// Run a set of the car in the shadow of the one in force, in place of any that does; None ends that.
+    /// Run a set of the car as the shadow set, in place of the present one; None ends it.
     Shadow {
         /// Its name.
         name: Option<String>,
@@ -114,23 +114,23 @@ pub enum RatesAction {
     Set(Rates),
 }
 
-/// How often a car sends what.
+/// The rates of a car's telemetry.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Rates {
-    /// Most poses per second; 0 for none, infinitely many being 1000 [Hz].
+    /// Most poses per second [Hz]; 0 for none, 1000 for every pose.
     pub pose: f32,
     /// Clouds per second [Hz].
     pub cloud: f32,
     /// Scan views per second [Hz].
     pub scan: f32,
-    /// Health messages per second, beside those on a change of state [Hz].
+    /// Health messages per second [Hz], in addition to one on each change of state.
     pub health: f32,
     /// Send the full-rate streams for the recorder.
     pub recorded: bool,
 }
 
 impl Rates {
-    /// Highest rate that can be asked for [Hz].
+    /// Highest rate that can be set [Hz].
     pub const MAX: f32 = 1000.0;
 }
 
@@ -193,7 +193,7 @@ impl Message for Command {
     }
 }
 
-/// Tells a command from every other: 128 random bits, 32 hexadecimal digits in text.
+/// Unique id of a command: 128 random bits, 32 hexadecimal digits in text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct CommandId(pub u128);
 
@@ -222,7 +222,7 @@ impl FromStr for CommandId {
     }
 }
 
-// Digits where people read, 16 bytes where machines do.
+// Digits in formats for people, such as JSON; 16 bytes in binary formats.
 impl Serialize for CommandId {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         if serializer.is_human_readable() {

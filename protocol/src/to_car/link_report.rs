@@ -1,15 +1,15 @@
-//! What the pit wall sees of a car's link, told to the car: only the far end knows how late messages arrive.
+//! The pit wall's measurement of a car's link. Only the receiving end can measure how late messages arrive.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Message, Schema};
 
-/// Put once a second, for the car to send less while its link is slow.
+/// Sent once a second, so that the car can send less while its link is slow.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LinkReport {
-    /// From publishing a pose to its arrival, the median of the last second, the clocks' offset taken out [s].
+    /// Time from publishing a pose to its arrival: median of the last second, corrected by the clocks' offset [s].
     pub transit: f32,
-    /// How far that may be wrong, for what is not known of the clocks' offset [s].
+    /// Largest error of `transit`, from the uncertainty of the clocks' offset [s].
     pub uncertainty: f32,
     /// Poses that arrived in that second.
     pub poses: u32,

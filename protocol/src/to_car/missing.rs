@@ -1,37 +1,37 @@
-//! Asking a car again for what did not come.
+//! Requests for messages that were lost.
 //!
 //! ```text
-//! pit wall --- of these streams I lack these numbers; answer with at most so many bytes ---> car
-//!          <-- the messages, oldest first; what is still kept of each stream, and its last number ---
+//! pit wall --- missing numbers of each stream, most bytes of the reply ------------------> car
+//!          <-- the messages, oldest first; the first and last number kept of each stream ---
 //! ```
 //!
-//! One answer is one message of bounded length: what is missing comes in pieces as large as the link can take between
-//! two poses, and the asker sets the pace. Ranges that the car no longer keeps are those before [`Kept::first`].
+//! A reply is one message of bounded length, so the pit wall decides the pace and a reply fits between two poses. Messages
+//! before [`Kept::first`] are no longer kept and cannot be had.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Invalid, Message, Schema, Topic};
 
-/// Asks for messages by number.
+/// Requests messages by number.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MissingRequest {
     /// The run of the car that the numbers belong to. A car in another run sends no messages; the header of its
-    /// answer carries its own run id.
+    /// reply carries its own run id.
     pub run_id: u64,
-    /// What is missing, the most urgent stream first, at most [`MissingRequest::MAX_STREAMS`].
+    /// The missing numbers, the most urgent stream first, at most [`MissingRequest::MAX_STREAMS`].
     pub streams: Vec<Wanted>,
-    /// How long the messages in the answer may be together [bytes]. One comes in any case.
+    /// Total length of the messages in the reply [bytes]. One message is sent even if it is longer.
     pub budget: u32,
 }
 
 impl MissingRequest {
     /// Most streams in one request.
     pub const MAX_STREAMS: usize = 16;
-    /// Largest budget that a car goes along with [bytes].
+    /// Largest budget that a car accepts [bytes].
     pub const MAX_BUDGET: u32 = 64 * 1024;
 }
 
-/// What is missing of one stream.
+/// The missing numbers of one stream.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Wanted {
     /// The stream.
@@ -45,27 +45,27 @@ impl Wanted {
     pub const MAX_RANGES: usize = 64;
 }
 
-/// What a car still has of it.
+/// The messages requested, as far as the car still has them.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MissingReply {
     /// Every stream that the car keeps.
     pub streams: Vec<Kept>,
-    /// Messages as they were sent, header and all.
+    /// The messages as they were sent, with their headers.
     pub messages: Vec<Resent>,
 }
 
-/// What a car keeps of one stream.
+/// The range of messages that a car keeps of one stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Kept {
     /// The stream.
     pub topic: Topic,
     /// Number of the oldest message that it still has.
     pub first: u64,
-    /// Number of the last message that it made.
+    /// Number of the last message that it has sent.
     pub last: u64,
 }
 
-/// A message once more.
+/// A message that is sent again.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Resent {
     /// Its stream.
@@ -94,6 +94,6 @@ impl Message for MissingRequest {
 
 impl Message for MissingReply {
     const SCHEMA: Schema = Schema::MissingReply;
-    /// The largest budget, and the largest message beyond it.
+    /// The largest budget plus the largest message.
     const MAX_LEN: usize = 256 * 1024;
 }

@@ -1,4 +1,4 @@
-//! What the pit wall tells a car to do, and the car's answers.
+//! Messages to a car and the answers to them: commands, requests for lost messages, link reports.
 
 mod answer;
 mod command;

@@ -1,4 +1,4 @@
-//! The particle cloud, small enough to send ten times a second.
+//! A sample of the particle cloud, small enough to send ten times a second.
 
 use std::f64::consts::PI;
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Invalid, Message, Pose2, Schema};
 
-/// Summary of the particles, and some of them.
+/// Summary of all particles, and a sample of them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cloud {
     /// The filter update that it belongs to.
@@ -21,9 +21,9 @@ pub struct Cloud {
     pub spread_across: f32,
     /// Mass of the second cluster over that of the first, in `[0, 1]`.
     pub second_mode: f32,
-    /// What the particles' positions are relative to [m].
+    /// The point that particle positions are relative to [m].
     pub centre: [f64; 2],
-    /// At most [`Cloud::MAX_PARTICLES`], drawn by weight or evenly.
+    /// The sample: at most [`Cloud::MAX_PARTICLES`], drawn by weight or evenly.
     pub particles: Vec<CloudParticle>,
 }
 
@@ -55,16 +55,16 @@ pub struct CloudParticle {
 }
 
 impl CloudParticle {
-    /// Step of a position [m]: 327 m can be told on either side of the centre.
+    /// Step of a position [m]. It reaches 327 m to either side of the centre.
     pub const METRES: f64 = 0.01;
     /// Step of a heading [rad].
     pub const RADIANS: f64 = PI / 32768.0;
 
-    /// Rounds a particle. `weight` is relative to the heaviest one, in `[0, 1]`. Positions too far off end up at
-    /// the edge.
+    /// Rounds a particle. `weight` is relative to the heaviest one, in `[0, 1]`. Positions out of range become the
+    /// outermost ones.
     pub fn quantise(pose: Pose2, centre: [f64; 2], weight: f64) -> Self {
-        // A float that is out of range, or NaN, saturates or becomes 0 in `as`. A heading of pi would saturate to
-        // just below pi, so it goes through i32 and wraps to -pi, which is the same direction.
+        // `as` saturates floats out of range and turns NaN into 0. A heading of pi would saturate to just below pi.
+        // Through i32 it wraps to -pi, which is the same direction.
         Self {
             x: ((pose.x - centre[0]) / Self::METRES).round() as i16,
             y: ((pose.y - centre[1]) / Self::METRES).round() as i16,
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn far_particles_end_up_at_the_edge() {
+    fn far_particles_saturate() {
         let far = Pose2 {
             x: 1e9,
             y: -1e9,

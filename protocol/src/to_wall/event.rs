@@ -8,10 +8,10 @@ use super::older_event;
 use crate::codec::Payload;
 use crate::{Cause, CodecError, CommandId, Message, Pose2, Rates, Schema, Severity, State, Value};
 
-/// Something that happened, at the header's sensor time.
+/// Something that happened at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Event {
-    /// What.
+    /// What happened.
     pub kind: EventKind,
     /// The last filter update before it; 0 before the first.
     pub update: u64,
@@ -86,7 +86,7 @@ pub enum EventKind {
         /// The set.
         set: SetRef,
     },
-    /// The car fell back by itself, because nobody confirmed.
+    /// The car fell back to the earlier set by itself, because nobody confirmed the new one.
     ParametersFellBack {
         /// Before.
         from: SetRef,
@@ -99,10 +99,10 @@ pub enum EventKind {
     SetStored {
         /// Its name.
         name: String,
-        /// What `changes` compare it with: the set of the same name that it replaces, or, for a new one, the set that was in
-        /// force, of which it keeps what was not given. Empty where a car of an older version did not tell.
+        /// The set that `changes` compare it with. A replaced set is compared with its old values; a new set with the set in
+        /// force, which it takes the remaining values from. Empty where a car of an older version did not send it.
         from: String,
-        /// Every value in which the two differ.
+        /// Every value that differs.
         changes: Vec<ValueChange>,
     },
     /// A set was deleted from the car.
@@ -112,7 +112,7 @@ pub enum EventKind {
     },
     /// A pose to start from was given.
     PoseInitialized {
-        /// Where the car believed to be before, if it did.
+        /// The estimate before, if there was one.
         before: Option<Pose2>,
         /// `map_from_base_link`.
         pose: Pose2,
@@ -128,7 +128,7 @@ pub enum EventKind {
     Lap {
         /// The lap that ended, from 1.
         lap: u32,
-        /// Its time; None for the first crossing, which ends no whole lap [s].
+        /// Its time [s]; None for the first crossing, which ends no whole lap.
         time: Option<f64>,
         /// The set in force at its end.
         set: String,
@@ -145,7 +145,7 @@ pub enum EventKind {
         /// How long it lasted [s].
         duration: f32,
     },
-    /// The car would rather use another set.
+    /// The car proposes another set.
     Proposed {
         /// That set.
         set: String,
@@ -166,53 +166,54 @@ pub enum EventKind {
     },
     /// A command was refused.
     CommandRefused {
-        /// Every fault.
+        /// Every reason.
         faults: Vec<String>,
     },
     /// A bag or a race came to its end.
     SourceEnded,
-    /// Something is not as it should be; the car goes on.
+    /// Something is wrong; the car goes on.
     Warning {
-        /// What.
+        /// What is wrong.
         text: String,
     },
     /// Something failed.
     Error {
-        /// What.
+        /// What is wrong.
         text: String,
     },
-    /// A set runs in the shadow of the one in force.
+    /// A second set runs on the same scans as the set in force.
     ShadowStarted {
         /// That set.
         set: String,
     },
-    /// It was ended on request.
+    /// The second set was ended on request.
     ShadowEnded {
         /// That set.
         set: String,
     },
-    /// The car has dropped it, because there was not enough CPU for both.
+    /// The car ended the second set, because there was not enough CPU for both.
     ShadowDropped {
         /// That set.
         set: String,
         /// Why, in words with numbers.
         evidence: String,
     },
-    /// The link is slow: the car sends less than it was asked for.
+    /// The link is slow: the car sends less than requested.
     RatesLowered {
         /// From publishing a pose to its arrival [s].
         transit: f32,
         /// Poses per second now [Hz].
         pose: f32,
-        /// The full-rate streams for the recorder go on; if not, the car keeps them, and sends them as the link allows.
+        /// True while the full-rate streams for the recorder go on. Otherwise the car keeps them and sends them when the link
+        /// allows.
         recorded: bool,
     },
-    /// The link has recovered: the car sends what it was asked for.
+    /// The link has recovered: the car sends what was requested.
     RatesRestored,
 }
 
 impl EventKind {
-    /// How much it counts.
+    /// How severe it is.
     pub fn severity(&self) -> Severity {
         match self {
             Self::StateChanged { to, .. } => match to {
@@ -241,7 +242,7 @@ impl fmt::Display for EventKind {
         let pose = |p: &Pose2| format!("({:.2}, {:.2}) m, {:.1} deg", p.x, p.y, p.heading.to_degrees());
         match self {
             Self::Started { version } => write!(f, "node started, version {version}"),
-            Self::Stopping { reason } => write!(f, "node stops: {reason}"),
+            Self::Stopping { reason } => write!(f, "node stopping: {reason}"),
             Self::StateChanged { from, to, causes } => {
                 write!(f, "{from} -> {to}")?;
                 for (i, cause) in causes.iter().enumerate() {
@@ -255,12 +256,7 @@ impl fmt::Display for EventKind {
                 update,
                 revert_after,
             } => {
-                write!(
-                    f,
-                    "set {} in place of {} from update {update}",
-                    set(to),
-                    set(from)
-                )?;
+                write!(f, "set {} replaces {} from update {update}", set(to), set(from))?;
                 match revert_after {
                     Some(seconds) => write!(f, "; falls back after {seconds:.0} s unless confirmed"),
                     None => Ok(()),
@@ -269,9 +265,9 @@ impl fmt::Display for EventKind {
             Self::ParametersConfirmed { set: name } => write!(f, "set {} confirmed", set(name)),
             Self::ParametersFellBack { from, to, update } => {
                 let (from, to) = (set(from), set(to));
-                write!(f, "nobody confirmed {from}: back to {to} from update {update}")
+                write!(f, "{from} was not confirmed: back to {to} from update {update}")
             }
-            Self::SetStored { name, from, changes } => tell_stored(f, name, from, changes),
+            Self::SetStored { name, from, changes } => fmt_stored(f, name, from, changes),
             Self::SetDeleted { name } => write!(f, "set {name} deleted"),
             Self::PoseInitialized { before, pose: at } => {
                 write!(f, "initial pose {}", pose(at))?;
@@ -311,16 +307,16 @@ impl fmt::Display for EventKind {
                 recorded,
             } => {
                 let rest = if *recorded {
-                    "less of the rest"
+                    "less of everything else"
                 } else {
-                    "the full-rate streams as the link allows"
+                    "full-rate streams when the link allows"
                 };
                 write!(
                     f,
-                    "slow link, poses arrive after {transit:.2} s: sends {pose:.0} poses a second and {rest}"
+                    "slow link, poses arrive after {transit:.2} s: sends {pose:.0} poses per second and {rest}"
                 )
             }
-            Self::RatesRestored => f.write_str("the link has recovered: sends as much as before"),
+            Self::RatesRestored => f.write_str("link recovered: requested rates again"),
         }
     }
 }
@@ -328,14 +324,14 @@ impl fmt::Display for EventKind {
 /// Values of a stored set that the text lists.
 const LISTED: usize = 8;
 
-fn tell_stored(f: &mut fmt::Formatter<'_>, name: &str, from: &str, changes: &[ValueChange]) -> fmt::Result {
+fn fmt_stored(f: &mut fmt::Formatter<'_>, name: &str, from: &str, changes: &[ValueChange]) -> fmt::Result {
     if from.is_empty() {
         return write!(f, "set {name} stored");
     }
     let (stored, but) = if from == name {
-        (format!("set {name} stored in place of what it was"), ": ")
+        (format!("set {name} replaced"), ": ")
     } else {
-        (format!("set {name} stored, as {from}"), " but for ")
+        (format!("set {name} stored from {from}"), " with ")
     };
     if changes.is_empty() {
         return write!(f, "{stored}: no value differs");
@@ -350,8 +346,8 @@ fn tell_stored(f: &mut fmt::Formatter<'_>, name: &str, from: &str, changes: &[Va
 
 impl Message for Event {
     const SCHEMA: Schema = Schema::Event;
-    /// 2: what was before a new pose and new rates; whether the full-rate streams go on over a slow link.
-    /// 3: the values of a stored set that differ.
+    /// Version 2 added the pose and the rates before a change, and whether the full-rate streams go on over a slow link.
+    /// Version 3 added the values in which a stored set differs.
     const VERSION: u16 = 3;
 
     fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {

@@ -1,4 +1,4 @@
-//! How well the car is localized, and why.
+//! How well the car is localized, with the causes.
 
 use std::fmt;
 
@@ -7,20 +7,20 @@ use serde::{Deserialize, Serialize};
 use crate::codec::Payload;
 use crate::{CodecError, Invalid, Message, Schema};
 
-/// The state with its causes, and every number behind it.
+/// The state, its causes and the metrics behind it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Health {
     /// The state.
     pub state: State,
     /// When this state was entered [unix ns].
     pub since: i64,
-    /// Why: the worst first; empty when all is well. At most [`Health::MAX_CAUSES`].
+    /// The causes, the worst first. Empty when all is well. At most [`Health::MAX_CAUSES`].
     pub causes: Vec<Cause>,
     /// The last filter update; 0 before the first.
     pub update: u64,
     /// What was measured at that update; None before the first.
     pub metrics: Option<Metrics>,
-    /// The set that the car would rather use, while that is not the one in force.
+    /// The set that the car proposes; None while it is the set in force.
     pub proposal: Option<Proposal>,
     /// True while the car switches sets by itself.
     pub auto: bool,
@@ -31,7 +31,7 @@ impl Health {
     pub const MAX_CAUSES: usize = 32;
 }
 
-/// What the car knows of its own pose.
+/// How far the car can rely on its pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
@@ -39,7 +39,7 @@ pub enum State {
     Init,
     /// A pose, not yet confirmed.
     Converging,
-    /// The pose can be raced on.
+    /// The pose is good enough to race on.
     Localized,
     /// The pose is probably right; something is wrong.
     Degraded,
@@ -70,11 +70,11 @@ impl fmt::Display for State {
 pub struct Cause {
     /// What is wrong.
     pub kind: CauseKind,
-    /// How much it counts.
+    /// How severe it is.
     pub severity: Severity,
     /// The value measured, in the unit of the metric.
     pub value: Option<f32>,
-    /// The threshold that it crossed.
+    /// The threshold that the value crossed.
     pub limit: Option<f32>,
 }
 
@@ -82,7 +82,7 @@ pub struct Cause {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CauseKind {
-    /// Nobody has given a pose to start from.
+    /// No initial pose was given.
     NoInitialPose,
     /// A new pose was given or found and is not yet confirmed by motion.
     NewPose,
@@ -90,19 +90,19 @@ pub enum CauseKind {
     Alignment,
     /// End points lie far from walls.
     Residual,
-    /// Beams are longer than the map says.
+    /// Beams are longer than in the map.
     LongBeams,
-    /// Beams are shorter than the map says: something stands in view.
+    /// Beams are shorter than in the map: something stands in view.
     Occluded,
-    /// Many beams come back with nothing.
+    /// Many beams have no return.
     NoReturn,
     /// Few particles carry the weight.
     EffectiveSampleSize,
     /// Scans fit worse than they used to.
     Likelihood,
-    /// Unsure along the track.
+    /// Large spread along the track.
     SpreadAlong,
-    /// Unsure across the track.
+    /// Large spread across the track.
     SpreadAcross,
     /// A second place fits nearly as well.
     SecondMode,
@@ -120,9 +120,9 @@ pub enum CauseKind {
     NoOdometry,
     /// Sensor data comes in and is refused.
     BadSensorData,
-    /// A search of the whole map is under way.
+    /// A search of the whole map is running.
     Searching,
-    /// Odometry has jumped: it began anew, or the car was carried.
+    /// Odometry has jumped: it restarted, or the car was carried.
     OdometryJump,
 }
 
@@ -185,13 +185,13 @@ impl fmt::Display for Cause {
     }
 }
 
-/// How much something counts.
+/// How severe something is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// Good to know; the state does not depend on it.
+    /// Information; the state does not depend on it.
     Info,
-    /// Makes the state DEGRADED where it concerns the pose.
+    /// Makes the state DEGRADED if it concerns the pose.
     Warning,
     /// Evidence that the pose is wrong, or that there is none.
     Critical,
@@ -204,9 +204,9 @@ pub struct Metrics {
     pub alignment: f32,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
     pub residual: f32,
-    /// Share of the valid beams more than 0.3 m shorter than the map says, in `[0, 1]`.
+    /// Share of the valid beams more than 0.3 m shorter than in the map, in `[0, 1]`.
     pub short_beams: f32,
-    /// Share of the valid beams more than 0.3 m longer than the map says, in `[0, 1]`.
+    /// Share of the valid beams more than 0.3 m longer than in the map, in `[0, 1]`.
     pub long_beams: f32,
     /// Share of the beams without a return, in `[0, 1]`.
     pub no_return: f32,
@@ -220,7 +220,7 @@ pub struct Metrics {
     pub spread_across: f32,
     /// Mass of the second cluster of particles over that of the first, in `[0, 1]`.
     pub second_mode: f32,
-    /// Slip: share of odometry's distance that was not driven; positive when the wheels spin.
+    /// Share of odometry's distance that was not driven. Positive when the wheels spin, negative when they lock.
     pub slip: f32,
     /// Odometry's yaw rate less the posterior's [rad/s].
     pub yaw_rate_residual: f32,
@@ -236,12 +236,12 @@ pub struct Metrics {
     pub particles: u32,
 }
 
-/// A set that the car would rather use.
+/// A set that the car proposes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Proposal {
     /// The set's name.
     pub set: String,
-    /// Why, in words with numbers.
+    /// The reason, with numbers.
     pub evidence: String,
     /// Since when [unix ns].
     pub since: i64,
@@ -251,7 +251,7 @@ impl Message for Health {
     const SCHEMA: Schema = Schema::Health;
     const MAX_LEN: usize = 4096;
 
-    /// 2: a cause more.
+    /// Version 2 added a cause.
     const VERSION: u16 = 2;
 
     fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
@@ -281,7 +281,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cause_reads_as_a_sentence() {
+    fn a_cause_shows_value_and_limit() {
         let cause = |kind, value, limit| {
             let severity = Severity::Warning;
             Cause {

@@ -1,4 +1,4 @@
-//! Answers to questions about the car itself: what it is, and what its clock says.
+//! Replies to queries about the car: what runs on it, and the time of its clock.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,13 +11,13 @@ pub struct CarInfo {
     pub version: String,
     /// Start of the node, in ns since 1970. It is the [`run_id`](crate::Header::run_id) of its messages.
     pub started: u64,
-    /// Where the sensor data comes from, in words.
+    /// Description of the source of the sensor data.
     pub source: String,
     /// Name of the map.
     pub map: String,
     /// Length of a lap of the raceline [m]; None without a raceline.
     pub lap_length: Option<f64>,
-    /// Where the laser is mounted.
+    /// Pose of the laser on the car.
     pub base_link_from_laser: Pose2,
     /// Name of the machine.
     pub host: String,
@@ -28,10 +28,10 @@ impl Message for CarInfo {
     const MAX_LEN: usize = 4096;
 }
 
-/// "What time is it?"
+/// Asks for the time of the car's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClockRequest {
-    /// When the question was sent [ns, the asker's clock].
+    /// When the query was sent [ns, the sender's clock].
     pub sent: i64,
 }
 
@@ -40,20 +40,21 @@ impl Message for ClockRequest {
     const MAX_LEN: usize = 64;
 }
 
-/// The three times that make a clock offset and a round-trip time, with the fourth taken on arrival.
+/// Three of the four times that give a clock offset and a round-trip time. The sender of the query takes the fourth on
+/// arrival.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClockReply {
-    /// [`ClockRequest::sent`], given back.
+    /// [`ClockRequest::sent`], returned.
     pub sent: i64,
-    /// When the question arrived [unix ns, the car's clock].
+    /// When the query arrived [unix ns, the car's clock].
     pub received: i64,
-    /// When this answer was made [unix ns, the car's clock].
+    /// When this reply was made [unix ns, the car's clock].
     pub answered: i64,
 }
 
 impl ClockReply {
-    /// What must be added to the asker's clock to get the car's, and the round-trip time [ns, ns]. The offset is
-    /// right to within half the round-trip time. `arrived` is on the asker's clock.
+    /// The offset of the car's clock from that of the query's sender, and the round-trip time [ns, ns]. The error of the
+    /// offset is at most half the round-trip time. `arrived` is when the reply arrived, by the sender's clock.
     pub fn offset_and_round_trip(&self, arrived: i64) -> (i64, i64) {
         let there = i128::from(self.received) - i128::from(self.sent);
         let back = i128::from(self.answered) - i128::from(arrived);
@@ -73,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_clock_ahead_by_a_second_is_seen_as_such() {
+    fn the_offset_of_a_clock_ahead_by_a_second() {
         // 10 ms there, 2 ms on the car, 10 ms back.
         let reply = ClockReply {
             sent: 0,
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn absurd_times_do_not_overflow() {
+    fn extreme_times_do_not_overflow() {
         let reply = ClockReply {
             sent: i64::MIN,
             received: i64::MAX,

@@ -1,4 +1,4 @@
-//! What the localizer costs the car, and how its data flows.
+//! CPU, memory, latencies and rates of the car's node.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,15 +17,15 @@ pub struct Load {
     pub memory_used: u64,
     /// Memory of the machine [bytes].
     pub memory_total: u64,
-    /// The hottest sensor of the machine [deg C]; None where it does not tell.
+    /// Temperature of the machine's hottest sensor [deg C]; None where there is no sensor.
     pub temperature: Option<f32>,
-    /// True while the machine slows down for heat or lack of power; None where it does not tell.
+    /// True while the machine slows down for heat or lack of power; None where that is not known.
     pub throttled: Option<bool>,
-    /// Time of a whole filter update, scan in to estimate out [us].
+    /// Time of a whole filter update, from the scan to the estimate [us].
     pub update_us: Latency,
     /// Age of a scan when it reached the filter [us].
     pub scan_age_us: Latency,
-    /// From a pose leaving the filter to the network having taken it [us].
+    /// Time from a pose leaving the filter until the network has accepted it [us].
     pub publish_lag_us: Latency,
     /// Scans per second.
     pub scan_rate: f32,
@@ -37,7 +37,7 @@ pub struct Load {
     pub scan_jitter: f32,
     /// Messages waiting for the filter.
     pub queue_depth: u32,
-    /// What was dropped since the node started.
+    /// Messages dropped since the node started.
     pub drops: Drops,
 }
 
@@ -60,7 +60,7 @@ pub struct Latency {
 /// Messages dropped since the node started, by cause.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Drops {
-    /// Sensor messages with NaN, infinities or a geometry that makes no sense.
+    /// Sensor messages with NaN, infinities or an impossible geometry.
     pub malformed: u64,
     /// Sensor messages not later than the last one of their kind.
     pub time_backwards: u64,
@@ -81,12 +81,12 @@ pub struct Drops {
 }
 
 impl Drops {
-    /// All of them.
+    /// The sum of all causes.
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(_, count)| count).sum()
     }
 
-    /// Each with its name.
+    /// Each count with the name of its cause.
     pub fn named(&self) -> [(&'static str, u64); 9] {
         [
             ("malformed", self.malformed),

@@ -19,7 +19,7 @@ pub struct MapReply {
     pub origin: Pose2,
     /// The cells from the lower left corner, row by row upwards, as runs of equal ones.
     pub runs: Vec<(Cell, u32)>,
-    /// The raceline; None where the car has none.
+    /// The raceline; None where the car has no raceline.
     pub raceline: Option<MapRaceline>,
 }
 
@@ -32,16 +32,16 @@ pub struct MapRaceline {
     pub points: Vec<[f32; 2]>,
 }
 
-/// What a map says of a cell.
+/// The state of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "u8", into = "u8")]
 #[repr(u8)]
 pub enum Cell {
-    /// A car can be here.
+    /// Free space.
     Free = 0,
     /// A wall or an obstacle.
     Occupied = 1,
-    /// Never seen.
+    /// Not mapped.
     Unknown = 2,
 }
 
@@ -87,7 +87,7 @@ impl MapReply {
             .flat_map(|&(cell, length)| std::iter::repeat_n(cell, length as usize))
     }
 
-    /// The cells as ROS gives them (`nav_msgs/OccupancyGrid`): 0 free, 100 occupied, 255 unknown.
+    /// The cells as in ROS (`nav_msgs/OccupancyGrid`): 0 free, 100 occupied, 255 unknown.
     pub fn occupancy(&self) -> Vec<u8> {
         self.cells()
             .map(|cell| match cell {

@@ -1,4 +1,4 @@
-//! What a car says of itself, and its answers to questions.
+//! Messages from a car: telemetry and replies to queries.
 
 mod cloud;
 mod event;

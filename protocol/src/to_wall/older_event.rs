@@ -1,12 +1,14 @@
-//! Events of versions 1 and 2, read as events of today: recordings and cars of then have them. What stands here is
-//! frozen. Kinds that are not named here have kept their layout; one that gets another leaves its old fields here.
+//! Reads events of versions 1 and 2, which older recordings and older cars have.
+//!
+//! The structs here never change. Kinds that are not named here have kept their layout. When a kind changes, its old
+//! fields come here.
 
 use serde::Deserialize;
 
 use crate::codec::Payload;
 use crate::{CodecError, CommandId, Event, EventKind, Pose2};
 
-/// The payload, if it is of a version that is known.
+/// Reads the payload of a known version.
 pub(super) fn read(version: u16, payload: &Payload<'_>) -> Option<Result<Event, CodecError>> {
     match (version, payload.variant()) {
         (1 | 2, Some(6)) => Some(with::<SetStored>(payload)),
@@ -39,7 +41,7 @@ fn with<K: Into<EventKind> + serde::de::DeserializeOwned>(
 
 #[derive(Deserialize)]
 struct Older<K> {
-    #[expect(dead_code, reason = "it has said that the kind is K")]
+    #[expect(dead_code, reason = "the caller has read it to choose K")]
     variant: u32,
     kind: K,
     update: u64,
@@ -59,7 +61,7 @@ struct PoseInitialized {
     pose: Pose2,
 }
 
-/// Before version 2: not from what, and not to what.
+/// Before version 2: without the rates.
 #[derive(Deserialize)]
 struct RatesChanged;
 
@@ -89,7 +91,7 @@ impl From<PoseInitialized> for EventKind {
 impl From<RatesChanged> for EventKind {
     fn from(RatesChanged: RatesChanged) -> Self {
         Self::Warning {
-            text: "telemetry rates changed; this version of the car did not say how".to_owned(),
+            text: "telemetry rates changed; the car's version does not send how".to_owned(),
         }
     }
 }

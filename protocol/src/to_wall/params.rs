@@ -6,12 +6,12 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Invalid, Message, Schema};
 
-/// The set in force, and those to choose from.
+/// The set in force, and the names of all sets on the car.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Params {
     /// The set in force.
     pub set: ParameterSet,
-    /// Counts changes of the set in force since the car was first set up; goes up by one with each.
+    /// Counts the changes of the set in force since the car was first set up.
     pub revision: u64,
     /// Who put it in force: an operator's name, `start` or `auto`.
     pub who: String,
@@ -19,22 +19,22 @@ pub struct Params {
     pub when: i64,
     /// The first filter update under it.
     pub since_update: u64,
-    /// Set while the car will fall back by itself.
+    /// Set while the car waits for a confirmation, without which it falls back.
     pub pending_revert: Option<PendingRevert>,
     /// Names of all sets on the car.
     pub available: Vec<String>,
 }
 
-/// The car will go back to another set unless this one is confirmed.
+/// The car falls back to another set unless the set in force is confirmed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PendingRevert {
-    /// The set it goes back to.
+    /// The set that it falls back to.
     pub to: String,
     /// When [unix ns, the car's clock].
     pub at: i64,
 }
 
-/// A named set of parameter values. What the names mean is the car's business: it refuses what it does not know.
+/// A named set of parameter values. The car decides which parameters exist, and refuses unknown ones.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ParameterSet {
     /// The set's name: 1 to [`ParameterSet::MAX_NAME`] characters of `[a-z0-9-]`.
@@ -61,7 +61,7 @@ impl ParameterSet {
     }
 }
 
-/// Refuses a name that could not be a file's.
+/// Refuses a name that cannot be used as a file name.
 pub(crate) fn set_name(field: &'static str, name: &str) -> Result<(), Invalid> {
     let allowed = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
     if (1..=ParameterSet::MAX_NAME).contains(&name.len()) && name.chars().all(allowed) {
@@ -83,9 +83,9 @@ pub enum Value {
     Bool(bool),
     /// A count.
     Int(i64),
-    /// A quantity, in the unit that the parameter's documentation says.
+    /// A quantity, in the unit that the parameter's documentation gives.
     Float(f64),
-    /// One of several words.
+    /// A choice among several words.
     Text(String),
 }
 

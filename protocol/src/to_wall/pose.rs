@@ -1,10 +1,10 @@
-//! Where the car is.
+//! The car's pose.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Covariance, Message, Pose2, Schema, Twist2};
 
-/// The pose of `base_link` in `map`, true at the header's sensor time.
+/// The pose of `base_link` in `map` at the header's sensor time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Pose {
     /// `map_from_base_link`.
@@ -13,17 +13,17 @@ pub struct Pose {
     pub twist: Twist2,
     /// Uncertainty of the pose, in `map`.
     pub covariance: Covariance,
-    /// Where on the raceline; None where the car has none.
+    /// Position relative to the raceline; None where the car has no raceline.
     pub track: Option<TrackPoint>,
-    /// Laps begun since the node started; 0 before the start line was crossed for the first time.
+    /// Laps begun since the node started; 0 before the first crossing of the start line.
     pub lap: u32,
     /// The filter update that this pose comes from; counts from 1.
     pub update: u64,
-    /// How it came about.
+    /// From a scan, or predicted.
     pub kind: PoseKind,
 }
 
-/// A place relative to a raceline.
+/// A position relative to a raceline.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TrackPoint {
     /// Arc length of the nearest point of the line [m].
@@ -32,13 +32,13 @@ pub struct TrackPoint {
     pub d: f64,
 }
 
-/// How a pose came about.
+/// What a pose was computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseKind {
     /// The posterior of a scan.
     Updated,
-    /// The last posterior, carried forward by the odometry since.
+    /// The last posterior, composed with the odometry since.
     Predicted,
 }
 

@@ -1,10 +1,10 @@
-//! Full-rate streams for the recorder: what is needed to run the filter again.
+//! Full-rate streams for the recorder. They hold all that is needed to run the filter again.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Invalid, Message, Pose2, Schema, Twist2};
 
-/// One message of wheel odometry as the filter got it, true at the header's sensor time.
+/// One message of wheel odometry as the filter received it, at the header's sensor time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct RecordedOdometry {
     /// `odom_from_base_link`.
@@ -18,7 +18,7 @@ impl Message for RecordedOdometry {
     const MAX_LEN: usize = 256;
 }
 
-/// One scan as the filter got it; its first beam was measured at the header's sensor time.
+/// One scan as the filter received it. Its first beam was measured at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordedScan {
     /// Direction of the first beam in the laser's frame [rad].
@@ -27,9 +27,9 @@ pub struct RecordedScan {
     pub angle_increment: f64,
     /// Time from one beam to the next; 0 when the whole scan has one time [s].
     pub time_increment: f64,
-    /// Readings below this are no measurement [m].
+    /// Shortest valid reading [m].
     pub range_min: f64,
-    /// Readings from here on mean "nothing in range" [m].
+    /// Readings from here on mean that nothing is in range [m].
     pub range_max: f64,
     /// One reading per beam [mm], [`RecordedScan::NO_RETURN`] where there was none; at most
     /// [`RecordedScan::MAX_BEAMS`].
@@ -39,7 +39,7 @@ pub struct RecordedScan {
 impl RecordedScan {
     /// Most beams in one message.
     pub const MAX_BEAMS: usize = 16_384;
-    /// Stands for a reading that is NaN, infinite, negative or beyond 65.534 m.
+    /// Marks a reading that is NaN, infinite, negative or beyond 65.534 m.
     pub const NO_RETURN: u16 = u16::MAX;
 
     /// A reading [m] in millimetres.
@@ -70,7 +70,7 @@ impl Message for RecordedScan {
     }
 }
 
-/// Where the car really is, from a simulator or a motion-capture system, at the header's sensor time.
+/// The true pose from a simulator or a motion-capture system, at the header's sensor time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
     /// `map_from_base_link`.
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_reading_comes_back_as_infinite() {
+    fn invalid_readings_become_infinite() {
         for range in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -0.1, 65.535, 1e9] {
             assert_eq!(RecordedScan::quantise(range), RecordedScan::NO_RETURN, "{range}");
         }

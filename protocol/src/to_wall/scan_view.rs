@@ -1,4 +1,4 @@
-//! The laser's end points, for drawing over the map.
+//! The laser's end points, to draw over the map.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,7 @@ use crate::{Invalid, Message, Schema};
 pub struct ScanView {
     /// The filter update that it belongs to.
     pub update: u64,
-    /// What the points are relative to: a point of `map` [m].
+    /// The point of `map` that the end points are relative to [m].
     pub centre: [f64; 2],
     /// At most [`ScanView::MAX_POINTS`], in the order of the beams.
     pub points: Vec<EndPoint>,
@@ -35,7 +35,7 @@ pub struct EndPoint {
     pub x: i16,
     /// Offset from the centre, in [`EndPoint::METRES`].
     pub y: i16,
-    /// What the map says to it.
+    /// How the reading compares with the map.
     pub kind: EndPointKind,
 }
 
@@ -43,7 +43,7 @@ impl EndPoint {
     /// Step of a position [m].
     pub const METRES: f64 = 0.01;
 
-    /// Rounds an end point in `map` [m]. Positions too far off end up at the edge.
+    /// Rounds an end point in `map` [m]. Positions out of range become the outermost ones.
     pub fn quantise(point: [f64; 2], centre: [f64; 2], kind: EndPointKind) -> Self {
         Self {
             x: ((point[0] - centre[0]) / Self::METRES).round() as i16,
@@ -60,11 +60,11 @@ impl EndPoint {
 pub enum EndPointKind {
     /// It ends at a wall of the map.
     OnWall = 0,
-    /// It ends off a wall, but not by enough to say why.
+    /// It ends off a wall, by less than `Short` and `Long` need.
     OffWall = 1,
-    /// It is much shorter than the map says: something stands in view.
+    /// It is much shorter than in the map: something stands in view.
     Short = 2,
-    /// It is much longer than the map says: a wrong pose, or a wall has gone.
+    /// It is much longer than in the map: the pose is wrong, or a wall is gone.
     Long = 3,
 }
 

@@ -1,25 +1,25 @@
-//! A second parameter set that runs beside the one in force, on the same scans, so that a switch is decided on
-//! evidence.
+//! The shadow set: a second parameter set that runs on the same scans as the set in force, to compare the two before a
+//! switch.
 
 use serde::{Deserialize, Serialize};
 
 use super::set_name;
 use crate::{Invalid, Latency, Message, Schema, SetRef};
 
-/// Which set runs in the shadow, and how it compares. Told once a second and when the set changes.
+/// The shadow set and its comparison with the set in force. Sent once a second and when the set changes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Shadow {
-    /// The set in the shadow; None while there is none.
+    /// The shadow set; None while there is none.
     pub set: Option<String>,
-    /// Who set it, or ended it: an operator's name, `start`, or `load` where the car has dropped it.
+    /// Who started or ended it: an operator's name, `start`, or `load` where the car ended it for lack of CPU.
     pub who: String,
     /// Since when [unix ns].
     pub since: i64,
-    /// The last seconds compared; None without a shadow, and until both sets have taken the same scans.
+    /// Comparison over the last seconds. None without a shadow set, and until both sets have processed the same scans.
     pub comparison: Option<Comparison>,
 }
 
-/// Two sets over the same scans. The better fit on a scan is the one with the smaller residual, where they differ by
+/// Two sets over the same scans. On each scan, the set with the smaller residual fits better if the residuals differ by
 /// more than [`Comparison::MARGIN`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
@@ -27,13 +27,13 @@ pub struct Comparison {
     pub in_force: SetRef,
     /// Time that it covers [s].
     pub window: f32,
-    /// Scans that both sets have taken.
+    /// Scans that both sets have processed.
     pub scans: u32,
-    /// Scans in the same time that the shadow has left out, because it must never hold up the set in force.
+    /// Scans in the same time that the shadow set skipped, because it must never delay the set in force.
     pub skipped: u32,
-    /// The set in force, over these scans.
+    /// Metrics of the set in force over these scans.
     pub force: Fitness,
-    /// The set in the shadow, over these scans.
+    /// Metrics of the shadow set over these scans.
     pub shadow: Fitness,
     /// Mean distance between the two poses [m].
     pub distance: f32,
@@ -43,16 +43,16 @@ pub struct Comparison {
     pub angle: f32,
     /// Share of the scans that fit better under the set in force, in `[0, 1]`.
     pub force_better: f32,
-    /// Share of the scans that fit better in the shadow, in `[0, 1]`.
+    /// Share of the scans that fit better under the shadow set, in `[0, 1]`.
     pub shadow_better: f32,
 }
 
 impl Comparison {
-    /// Residuals closer than this are equal [m].
+    /// Residuals that differ by less than this count as equal [m].
     pub const MARGIN: f64 = 0.002;
 }
 
-/// How well one set has done: means over the scans compared.
+/// Metrics of one set: means over the scans compared.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Fitness {
     /// See [`Metrics::alignment`](crate::Metrics::alignment), in `[0, 1]`.

@@ -1,14 +1,14 @@
 //! A signed distance field whose zero lies on the walls' faces, to a fraction of a cell.
 //!
-//! Walls and what lies behind them are negative, all else is positive. A field of distances to cell *centres* would pull
-//! every fit half a cell into a wall that was filled in: 2.5 cm on a common map, several times what a laser resolves.
-//! Walls drawn by a laser's own hits are thin instead, and their middle is where the laser saw them: on such a map (our
-//! `club`) the pose is 1.3 cm off in place of 1.5 cm.
+//! The distance is negative in walls and behind them, and positive elsewhere. A field of distances to cell *centres* would
+//! pull every fit half a cell into a filled wall: 2.5 cm on a common map, several times the laser's resolution. Walls
+//! drawn by the hits of a laser are thin, and the laser saw them at their middle. On such a map (the bundled `club`) the
+//! error of the pose is 1.3 cm with the zero in the middle, and 1.5 cm with it on the face.
 //!
-//! Only occupied cells are walls. Where mapping stopped, at an open door or a side corridor, free space borders on the
-//! unknown, and nothing stands on that line. Taken for walls, such lines pull the fit of a scan along a real corridor by
-//! up to 0.2 m. So the sign tells on which side of a wall a point lies, and the distance is to the nearest wall alone:
-//! where the unknown behind a wall borders on the unknown beyond a door, the field jumps.
+//! Only occupied cells are walls. Where mapping stopped, at an open door or a side corridor, free space borders on
+//! unknown space and there is no wall. Taken for walls, such lines pull the fit of a scan along a real corridor by up
+//! to 0.2 m. The sign gives the side of the wall, and the distance is to the nearest wall alone. The field therefore jumps
+//! where unknown space behind a wall borders on unknown space beyond a door.
 
 use rayon::prelude::*;
 
@@ -25,7 +25,7 @@ pub struct DistanceField {
     grid_from_map: Pose,
     /// Signed distance at each cell's centre [m].
     values: Vec<f32>,
-    /// By how much of it the zero lies inside the wall [m]; empty where it lies on the face everywhere.
+    /// Distance of the zero from the face, into the wall [m]; empty if it lies on the face everywhere.
     inwards: Vec<f32>,
 }
 
@@ -39,8 +39,8 @@ pub struct Sample {
 }
 
 impl DistanceField {
-    /// Builds the field: at each cell's centre, the distance to the walls' faces (`faces.rs`). Where walls are thin, the zero moves
-    /// to their middle.
+    /// Builds the field: the distance from each cell's centre to the nearest face. Where walls are thin, the zero moves to
+    /// their middle.
     pub fn new(grid: &OccupancyGrid) -> Self {
         let solidity = solidity(grid);
         let behind = behind_walls(grid, &solidity);
@@ -89,7 +89,7 @@ impl DistanceField {
         })
     }
 
-    /// The sample of the cell that holds a point in grid coordinates [cells], in metres; None outside the grid.
+    /// The sample of the cell that contains a point in grid coordinates [cells], in metres; None outside the grid.
     #[inline]
     pub fn nearest(&self, u: f32, v: f32) -> Option<f32> {
         if !(u >= 0.0 && v >= 0.0) {
@@ -99,8 +99,8 @@ impl DistanceField {
         (column < self.width && row < self.height).then(|| self.values[row * self.width + column])
     }
 
-    /// Distance from the wall's near face, whichever side of it, of the cell that holds a point in grid coordinates [cells],
-    /// in metres; None outside the grid.
+    /// Distance from the wall's near face, on either side of it, of the cell that contains a point in grid coordinates
+    /// [cells], in metres; None outside the grid.
     #[inline]
     pub fn from_wall(&self, u: f32, v: f32) -> Option<f32> {
         if !(u >= 0.0 && v >= 0.0) {
@@ -122,18 +122,18 @@ impl DistanceField {
         while path < longest {
             let point = [start[0] + path * direction[0], start[1] + path * direction[1]];
             let Some(sample) = self.sample(point[0], point[1]) else {
-                // The rim of half a cell, or the outside.
+                // Within half a cell of the border, or outside.
                 return path;
             };
             let distance = sample.distance * cells;
             if distance <= 0.0 {
-                // Between the last step and this one the field is as good as linear.
+                // Between the last step and this one the field is nearly linear.
                 return before
                     .map_or(0.0, |(p, d)| p + (path - p) * d / (d - distance))
                     .min(longest);
             }
             before = Some((path, distance));
-            // Not below a quarter of a cell, or a grazing ray creeps; a wall is thicker than that.
+            // At least a quarter of a cell, for speed along walls. Walls are thicker than that.
             path += distance.max(0.25);
         }
         longest
@@ -163,7 +163,7 @@ impl DistanceField {
         &self.values
     }
 
-    /// Signed distance at a point of `map` [m]; 0 outside the grid, where nothing is known.
+    /// Signed distance at a point of `map` [m]; 0 outside the grid.
     pub fn distance(&self, point: [f64; 2]) -> f64 {
         let [u, v] = self
             .grid_from_map
@@ -189,9 +189,9 @@ const FACE: f32 = 127.5;
 /// The directions to the cells around a cell: these four, and the opposite ones.
 const HALF_AROUND: [(i64, i64); 4] = [(1, 0), (1, 1), (0, 1), (-1, 1)];
 
-/// How solid each cell is, 0 to 255; None where the map does not say. The grey of a cell counts where it lies on a wall's
-/// face: an unknown cell between a free and an occupied one, or an occupied one beside a darker. Other occupied cells are
-/// solid, however pale the map is. On a map that marks no walls at all the unknown is solid.
+/// Solidity of each cell, 0 to 255; None for unknown cells. The grey of a cell counts where it lies on a wall's face: an
+/// unknown cell between a free and an occupied one, or an occupied one beside a darker one. Other occupied cells are solid,
+/// however pale the map is. On a map without occupied cells, unknown cells are solid.
 pub fn solidity(grid: &OccupancyGrid) -> Vec<Option<u8>> {
     let unknown = (!grid.cells.contains(&Cell::Occupied)).then_some(u8::MAX);
     let solid = |i: usize| {
@@ -228,11 +228,11 @@ pub fn solidity(grid: &OccupancyGrid) -> Vec<Option<u8>> {
     (0..grid.cells.len()).into_par_iter().map(solid).collect()
 }
 
-/// As far behind a wall a point is still one of its hits [m].
+/// A point this far behind a wall still counts as a hit of it [m].
 const SHADOW: f64 = 0.1;
 
-/// Which cells lie right behind a wall: those of which the map does not say, straight on from a free cell through occupied
-/// ones. Beside a wall's end, where a door is, there are none.
+/// The unknown cells right behind a wall: those on a straight line from a free cell through occupied ones. Beside the end of
+/// a wall, as at a door, there are none.
 fn behind_walls(grid: &OccupancyGrid, solidity: &[Option<u8>]) -> Vec<bool> {
     let mut behind = vec![false; solidity.len()];
     let shadow = (SHADOW / grid.resolution).ceil() as i64;
@@ -262,13 +262,13 @@ fn behind_walls(grid: &OccupancyGrid, solidity: &[Option<u8>]) -> Vec<bool> {
     behind
 }
 
-/// Walls up to so many cells thick were drawn by the hits of a laser, which scatter about the true face...
+/// Walls of up to this many cells were drawn by the hits of a laser, which scatter about the true face.
 const THIN: f32 = 2.0;
 
-/// ...and from so many on they were filled in, and their face is where they begin.
+/// Walls from this many cells on are filled: their face is their edge.
 const THICK: f32 = 4.0;
 
-/// Moves the field's zero from a thin wall's near face to its middle; returns by how much, for each cell [m].
+/// Moves the field's zero from a thin wall's near face to its middle. Returns the distance moved, for each cell [m].
 fn centre_thin_walls(grid: &OccupancyGrid, behind: &[bool], values: &mut [f32]) -> Vec<f32> {
     let resolution = grid.resolution as f32;
     let to_behind = distances(grid, |i| behind[i]);
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn where_mapping_stopped_there_is_no_wall() {
+    fn the_border_of_mapped_space_is_no_wall() {
         let rows = [
             "...#????", "...#????", "....????", "....????", "....????", "...#????", "...#????",
         ];
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_that_marks_no_walls_ends_at_the_unknown() {
+    fn without_occupied_cells_unknown_ones_are_walls() {
         let field = DistanceField::new(&drawn(&["...???", "...???", "...???"]));
         assert!((field.distance([1.5, 1.5]) - 1.5).abs() < 1e-6);
     }

@@ -1,41 +1,41 @@
-//! What can be wrong with a map or a raceline that somebody else made.
+//! Faults of map and raceline files.
 
 use std::path::Path;
 use std::{fs, io};
 
-/// Why a map or a raceline could not be read. `file` is a path, or what the caller called the bytes.
+/// Why a map or a raceline could not be read. `file` is a path, or the name that the caller gave the bytes.
 #[derive(Debug, thiserror::Error)]
 pub enum MapError {
     /// The file itself cannot be read.
     #[error("{file}: {source}")]
     Read {
-        /// What was read.
+        /// The file.
         file: String,
-        /// What the operating system said.
+        /// The error of the operating system.
         source: io::Error,
     },
-    /// Not the format it should be, as a whole.
+    /// The file has the wrong format.
     #[error("{file}: {fault}")]
     Format {
-        /// What was read.
+        /// The file.
         file: String,
         /// What is wrong with it.
         fault: String,
     },
-    /// One key has no value, or one that cannot be.
+    /// A key has no value or an invalid one.
     #[error("{file}: {key}: {fault}")]
     Key {
-        /// What was read.
+        /// The file.
         file: String,
         /// The key, as the file spells it.
         key: String,
         /// What is wrong with its value.
         fault: String,
     },
-    /// One line cannot be understood.
+    /// A line is invalid.
     #[error("{file}, line {line}: {fault}")]
     Line {
-        /// What was read.
+        /// The file.
         file: String,
         /// Counted from 1.
         line: u64,
@@ -44,7 +44,7 @@ pub enum MapError {
     },
 }
 
-/// Reads a text file, or says which one could not be read.
+/// Reads a text file. The error names it.
 pub fn read_text(path: impl AsRef<Path>) -> Result<String, MapError> {
     let path = path.as_ref();
     let file = path.display().to_string();

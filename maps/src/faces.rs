@@ -1,11 +1,13 @@
-//! Where the walls' faces run between the cells, and how far every cell is from them.
+//! The faces of walls, and the distance of every cell from them.
 //!
-//! A face is the line on which a cell's solidity, interpolated between the cells' centres, passes one half: on a map
-//! drawn or edited with anti-aliasing it is the wall itself, to a small part of a cell, and on a black and white one the
-//! cells' staircase with its corners cut. The distance to that line, not to the cells, is what a scan is fitted to: the
-//! steps that a field of distances to cells keeps beside a slanting wall look to a fit like structure along it. On an oval with
-//! long straights (`ims`, 6.4 cm cells, walls anti-aliased), where such steps are half of what there is to see, a simulated lap
-//! is 2.0 cm off (RMSE) in place of 10.9 cm with a field averaged over three grey levels.
+//! A face is the line on which the cells' solidity, interpolated between their centres, passes one half. On a map drawn or
+//! edited with anti-aliasing it is the wall itself, to a small part of a cell. On a black and white map it is the staircase
+//! of cells with its corners cut.
+//!
+//! Scans are fitted to the distance from this line, not from the cells. Beside a slanting wall, distances to cells have
+//! steps, which a fit takes for structure along the wall. On an oval with long straights (`ims`, 6.4 cm cells, anti-aliased
+//! walls) such steps are half of the visible structure. There a simulated lap has an RMSE of 2.0 cm with faces, and of
+//! 10.9 cm with distances averaged over three grey levels.
 
 use std::ops::Range;
 
@@ -16,8 +18,8 @@ use crate::marching_squares::{CORNERS, zero_lines};
 /// A segment of a face: its ends in cells from the centre of cell (0, 0).
 type Segment = [[f32; 2]; 2];
 
-/// How often cells look at what their neighbours have found. Of 9.6 million cells among random specks 0.06 % are not told the
-/// nearest face with one look and 0.01 % with two; none of them is within a cell and a half of it.
+/// Passes in which cells take over nearer faces from their neighbours. Of 9.6 million cells among random specks, 0.06 % miss
+/// the nearest face after one pass and 0.01 % after two. None of them is within a cell and a half of it.
 const LOOKS: usize = 2;
 
 /// The faces of all walls of a grid.
@@ -30,8 +32,8 @@ pub(crate) struct Faces {
 }
 
 impl Faces {
-    /// Follows the faces through `width * height` cells. `cell` tells how much more solid than a face a cell is, and if the
-    /// map says so: where a line passes no wall of the map's, only what is taken to lie behind one, it is no face.
+    /// Finds the faces between `width * height` cells. `cell` gives a cell's solidity above that of a face, and whether the
+    /// map gives it. A line between cells that are only assumed to lie behind a wall is no face.
     pub(crate) fn new(width: usize, height: usize, cell: impl Fn(usize) -> (f32, bool) + Sync) -> Self {
         let [columns, rows] = [width, height].map(|cells| cells.saturating_sub(1));
         let through_row = |row: usize| {
@@ -62,7 +64,7 @@ impl Faces {
         }
     }
 
-    /// Distance from each cell's centre to the nearest face [cells]; more than the grid is wide where there is none.
+    /// Distance from each cell's centre to the nearest face [cells]. Without a face it exceeds the grid's width.
     pub(crate) fn distances(&self) -> Vec<f32> {
         let touched = |i: usize| {
             let (column, row) = (i % self.width, i / self.width);
@@ -124,7 +126,7 @@ impl Faces {
     }
 }
 
-/// Appends the faces that pass through one square. Of a line of which only one end is on a wall of the map's, half counts.
+/// Appends the faces in one square. Where only one end of a line is on a wall of the map, half of the line counts.
 fn through_square(
     [column, row]: [usize; 2],
     width: usize,
@@ -157,11 +159,11 @@ fn squared_distance(point: [f32; 2], &[from, to]: &Segment) -> f32 {
     dx * dx + dy * dy
 }
 
-/// In place of a cell's index: there is none.
+/// Stands for "no cell".
 pub(crate) const NONE: u32 = u32::MAX;
 
-/// For each cell of a grid, row by row, the index of the nearest cell that is `wanted`; [`NONE`] if there is none at all
-/// (exact: Felzenszwalb and Huttenlocher, Theory of Computing 8, 2012).
+/// For each cell of a grid, row by row, the index of the nearest cell that is `wanted`; [`NONE`] if no cell is. Exact
+/// (Felzenszwalb and Huttenlocher, Theory of Computing 8, 2012).
 pub(crate) fn nearest_cells(width: usize, height: usize, wanted: impl Fn(usize) -> bool + Sync) -> Vec<u32> {
     // The column of the nearest in a cell's own row...
     let mut in_row = vec![NONE; width * height];
@@ -213,8 +215,8 @@ fn transposed<T: Copy + Send + Sync>(values: &[T], width: usize) -> Vec<T> {
         .collect()
 }
 
-/// At each of `count` places on a line, the place whose parabola is lowest there; `height_at` tells a parabola's height at
-/// its own place, and None if there is none.
+/// At each of `count` places on a line, the place whose parabola is lowest there. `height_at` gives a parabola's height at
+/// its own place, and None where there is no parabola.
 fn lower_envelope(count: usize, height_at: impl Fn(usize) -> Option<f64>) -> Vec<Option<usize>> {
     let mut roots: Vec<(usize, f64)> = Vec::new();
     let mut starts: Vec<f64> = Vec::new();

@@ -2,15 +2,15 @@
 
 use crate::Pose;
 
-/// What a map says of one cell.
+/// The state of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Cell {
-    /// A car can be here.
+    /// Free space.
     Free,
     /// A wall or an obstacle.
     Occupied,
-    /// Never seen.
+    /// Not mapped.
     Unknown,
 }
 
@@ -27,13 +27,13 @@ pub struct OccupancyGrid {
     pub origin: Pose,
     /// `width * height` cells, row by row from the bottom.
     pub cells: Vec<Cell>,
-    /// How much of each cell is wall, 0 (none) to 255 (all), in the order of `cells`: the grey of the map's
-    /// image. Maps drawn or edited with anti-aliasing say with it where in a cell a wall's face lies.
+    /// The share of wall in each cell, 0 (none) to 255 (all), in the order of `cells`: the grey of the map's image. On maps
+    /// drawn or edited with anti-aliasing it gives the place of a wall's face within the cell.
     pub occupancy: Vec<u8>,
 }
 
 impl OccupancyGrid {
-    /// A grid of which only the cells' states are known. Panics unless there are `width * height` cells.
+    /// A grid from the cells' states alone. Panics unless there are `width * height` cells.
     pub fn new(width: usize, height: usize, resolution: f64, origin: Pose, cells: Vec<Cell>) -> Self {
         assert_eq!(cells.len(), width * height, "one cell per place");
         let occupancy = cells
@@ -52,6 +52,13 @@ impl OccupancyGrid {
             cells,
             occupancy,
         }
+    }
+
+    /// True if a laser can see a wall: an occupied cell, or, on a map that marks no walls, the border of free and unknown
+    /// space.
+    pub fn has_wall(&self) -> bool {
+        let has = |state| self.cells.contains(&state);
+        has(Cell::Occupied) || has(Cell::Free) && has(Cell::Unknown)
     }
 
     /// The cell at (`column`, `row`); [`Cell::Unknown`] outside the grid.
@@ -76,7 +83,7 @@ impl OccupancyGrid {
         self.origin.transform(point.map(|v| v * self.resolution))
     }
 
-    /// The cell that holds a point of `map` [m]; [`Cell::Unknown`] outside the grid.
+    /// The cell that contains a point of `map` [m]; [`Cell::Unknown`] outside the grid.
     pub fn at(&self, point: [f64; 2]) -> Cell {
         let [column, row] = self.to_grid(point);
         self.cell(column.floor() as i64, row.floor() as i64)
@@ -98,6 +105,20 @@ mod tests {
             Cell::Free,
         ];
         OccupancyGrid::new(3, 2, 0.05, Pose::new(25.9, 48.5, 3.0), cells)
+    }
+
+    #[test]
+    fn a_map_of_one_state_has_no_wall() {
+        use Cell::{Free, Occupied, Unknown};
+        for (cells, expected) in [
+            ([Free, Free], false),
+            ([Unknown, Unknown], false),
+            ([Free, Occupied], true),
+            ([Free, Unknown], true),
+        ] {
+            let grid = OccupancyGrid::new(2, 1, 0.05, Pose::IDENTITY, cells.to_vec());
+            assert_eq!(grid.has_wall(), expected, "{cells:?}");
+        }
     }
 
     #[test]

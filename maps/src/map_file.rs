@@ -1,15 +1,17 @@
-//! Maps on disk and over the network: `map_server`'s YAML beside an image.
+//! Map files: the YAML of `map_server` beside an image.
 //!
-//! The semantics are those of `nav2_map_server` (`map_io.cpp`): an image's brightness becomes an occupancy, two
-//! thresholds make it free, occupied or unknown. Localization knows only these three, so `scale` and `raw` maps
-//! keep what is clearly free or occupied, and everything in between is [`Cell::Unknown`].
+//! The rules are those of `nav2_map_server` (`map_io.cpp`). An image's brightness becomes an occupancy; two thresholds
+//! make it free, occupied or unknown. Localization uses only these three states, so in `scale` and `raw` maps
+//! everything between the thresholds is [`Cell::Unknown`].
 
-use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::{env, fs};
 
 use serde::{Deserialize, Serialize};
+use serde_saphyr::options::DuplicateKeyPolicy;
 
-use crate::raster::{Raster, encode_png};
+use crate::image_file::{decode, encode_png};
+use crate::raster::Raster;
 use crate::{Cell, MapError, OccupancyGrid, Pose, read_text};
 
 /// Grey values that `map_saver` writes, which every reader's default thresholds tell apart.
@@ -56,30 +58,58 @@ pub enum MapMode {
 /// The file as people write it. Other keys are ignored, as `map_server` does.
 #[derive(Deserialize)]
 struct RawMetadata {
-    image: Option<String>,
-    resolution: Option<f64>,
-    origin: Option<Vec<f64>>,
-    negate: Option<Negate>,
-    occupied_thresh: Option<f64>,
-    free_thresh: Option<f64>,
-    mode: Option<String>,
+    image: Option<Scalar>,
+    resolution: Option<Scalar>,
+    origin: Option<Vec<Scalar>>,
+    negate: Option<Scalar>,
+    occupied_thresh: Option<Scalar>,
+    free_thresh: Option<Scalar>,
+    mode: Option<Scalar>,
 }
 
-/// `map_server` writes 0 or 1, people write true and false.
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum Negate {
-    Number(i64),
-    Flag(bool),
+/// A value as text, quoted or not: `map_server` makes no difference.
+#[derive(Debug, Clone, Deserialize)]
+struct Scalar(String);
+
+impl Scalar {
+    fn number(&self) -> Option<f64> {
+        self.0.trim().parse().ok()
+    }
+
+    /// YAML's words for true and false, and 0 and 1.
+    fn flag(&self) -> Option<bool> {
+        match self.0.trim().to_ascii_lowercase().as_str() {
+            "0" | "false" | "no" | "off" | "n" => Some(false),
+            "1" | "true" | "yes" | "on" | "y" => Some(true),
+            _ => None,
+        }
+    }
+}
+
+impl RawMetadata {
+    fn parse(file: &str, yaml: &str, duplicate_keys: DuplicateKeyPolicy) -> Result<Self, MapError> {
+        let options = serde_saphyr::options! { duplicate_keys: duplicate_keys };
+        serde_saphyr::from_str_with_options(yaml, options)
+            .map_err(|e| MapError::format(file, e.without_snippet().to_string()))
+    }
 }
 
 impl MapMetadata {
-    /// Reads the YAML; `file` names it in errors.
+    /// Reads the YAML; `file` names it in errors. Of a key that is given twice, the first value counts, as in
+    /// `map_server`.
     pub fn parse(file: &str, yaml: &str) -> Result<Self, MapError> {
-        let raw: RawMetadata = serde_saphyr::from_str(yaml)
-            .map_err(|e| MapError::format(file, e.without_snippet().to_string()))?;
+        let raw = RawMetadata::parse(file, yaml, DuplicateKeyPolicy::FirstWins)?;
         let missing = |key| MapError::key(file, key, "missing");
+        let number = |key, value: &Scalar| {
+            value
+                .number()
+                .ok_or_else(|| MapError::key(file, key, format!("{:?} is not a number", value.0)))
+        };
         let origin = raw.origin.ok_or_else(|| missing("origin"))?;
+        let origin: Vec<f64> = origin
+            .iter()
+            .map(|value| number("origin", value))
+            .collect::<Result<_, _>>()?;
         let origin = <[f64; 3]>::try_from(origin.as_slice())
             .ok()
             .filter(|origin| origin.iter().all(|v| v.is_finite()))
@@ -87,15 +117,22 @@ impl MapMetadata {
                 let fault = format!("{origin:?} should be three finite numbers: x [m], y [m], yaw [rad]");
                 MapError::key(file, "origin", fault)
             })?;
-        let resolution = raw.resolution.ok_or_else(|| missing("resolution"))?;
+        let resolution = number(
+            "resolution",
+            &raw.resolution.ok_or_else(|| missing("resolution"))?,
+        )?;
         // Not `<= 0.0`: NaN must fail too.
         if !(resolution.is_finite() && resolution > 0.0) {
             let fault = format!("{resolution} should be a positive length in metres");
             return Err(MapError::key(file, "resolution", fault));
         }
-        let share = |key, value: Option<f64>, default| match value.unwrap_or(default) {
-            value if (0.0..=1.0).contains(&value) => Ok(value),
-            value => Err(MapError::key(file, key, format!("{value} should lie in [0, 1]"))),
+        let share = |key, value: Option<Scalar>, default| {
+            let value = value.map_or(Ok(default), |value| number(key, &value))?;
+            if (0.0..=1.0).contains(&value) {
+                Ok(value)
+            } else {
+                Err(MapError::key(file, key, format!("{value} should lie in [0, 1]")))
+            }
         };
         let occupied_thresh = share("occupied_thresh", raw.occupied_thresh, OCCUPIED_THRESH)?;
         let free_thresh = share("free_thresh", raw.free_thresh, FREE_THRESH)?;
@@ -103,28 +140,30 @@ impl MapMetadata {
             let fault = format!("{free_thresh} is above occupied_thresh {occupied_thresh}");
             return Err(MapError::key(file, "free_thresh", fault));
         }
+        let negate = raw.negate.map_or(Ok(false), |value| {
+            value
+                .flag()
+                .ok_or_else(|| MapError::key(file, "negate", format!("{} should be 0 or 1", value.0)))
+        })?;
+        let mode = raw.mode.map_or(Ok(MapMode::Trinary), |value| {
+            match value.0.trim().to_ascii_lowercase().as_str() {
+                "trinary" => Ok(MapMode::Trinary),
+                "scale" => Ok(MapMode::Scale),
+                "raw" => Ok(MapMode::Raw),
+                _ => {
+                    let fault = format!("{:?} should be trinary, scale or raw", value.0);
+                    Err(MapError::key(file, "mode", fault))
+                }
+            }
+        })?;
         Ok(Self {
-            image: raw.image.ok_or_else(|| missing("image"))?,
+            image: raw.image.ok_or_else(|| missing("image"))?.0,
             resolution,
             origin,
-            negate: match raw.negate {
-                None | Some(Negate::Number(0) | Negate::Flag(false)) => false,
-                Some(Negate::Number(1) | Negate::Flag(true)) => true,
-                Some(Negate::Number(other)) => {
-                    return Err(MapError::key(file, "negate", format!("{other} should be 0 or 1")));
-                }
-            },
+            negate,
             occupied_thresh,
             free_thresh,
-            mode: match raw.mode.as_deref() {
-                None | Some("trinary") => MapMode::Trinary,
-                Some("scale") => MapMode::Scale,
-                Some("raw") => MapMode::Raw,
-                Some(other) => {
-                    let fault = format!("{other:?} should be trinary, scale or raw");
-                    return Err(MapError::key(file, "mode", fault));
-                }
-            },
+            mode,
         })
     }
 
@@ -155,13 +194,13 @@ impl MapMetadata {
 }
 
 impl OccupancyGrid {
-    /// Reads a map: `path` is the YAML file, which names the image beside it.
+    /// Reads a map: `path` is the YAML file, which names the image.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
         let file = path.display().to_string();
         let yaml = read_text(path)?;
         let metadata = MapMetadata::parse(&file, &yaml)?;
-        let image = path.parent().unwrap_or(Path::new("")).join(&metadata.image);
+        let image = find_image(path, &yaml, &metadata)?;
         let bytes = fs::read(&image).map_err(|e| {
             let fault = format!("{}: {e}", image.display());
             MapError::key(&file, "image", fault)
@@ -176,7 +215,7 @@ impl OccupancyGrid {
     }
 
     fn decode(metadata: &MapMetadata, file: &str, image: &[u8]) -> Result<Self, MapError> {
-        let image = Raster::decode(file, image)?;
+        let image = decode(file, image)?;
         let (width, height) = (image.width, image.height);
         // The image's first row is the map's last.
         let (cells, occupancy) = (0..height)
@@ -233,6 +272,39 @@ impl OccupancyGrid {
     }
 }
 
+/// The image's path. A relative one begins at the YAML file's folder, `~/` at the home folder.
+fn find_image(yaml_file: &Path, yaml: &str, metadata: &MapMetadata) -> Result<PathBuf, MapError> {
+    let file = yaml_file.display().to_string();
+    let folder = yaml_file.parent().unwrap_or(Path::new(""));
+    let first = resolve(
+        &file,
+        folder,
+        &metadata.image,
+        env::var_os("HOME").map(PathBuf::from),
+    )?;
+    if first.exists() {
+        return Ok(first);
+    }
+    // Other readers take the last of several images. Where the first does not exist, the last was meant.
+    let last = RawMetadata::parse(&file, yaml, DuplicateKeyPolicy::LastWins)?.image;
+    let last = last.map(|image| resolve(&file, folder, &image.0, None));
+    Ok(match last {
+        Some(Ok(last)) if last.exists() => last,
+        _ => first,
+    })
+}
+
+/// An image's path, with a leading `~/` replaced by the home folder.
+fn resolve(file: &str, folder: &Path, image: &str, home: Option<PathBuf>) -> Result<PathBuf, MapError> {
+    match image.strip_prefix("~/") {
+        Some(rest) => home.map(|home| home.join(rest)).ok_or_else(|| {
+            let fault = format!("{image}: the home folder is not known: HOME is not set");
+            MapError::key(file, "image", fault)
+        }),
+        None => Ok(folder.join(image)),
+    }
+}
+
 /// An occupancy in [0, 1] as a grey value, 255 all wall.
 fn grey(occupancy: f64) -> u8 {
     (occupancy * 255.0).round() as u8
@@ -268,6 +340,66 @@ mod tests {
         assert_eq!(cells(&yaml, b"P2 2 1 255 255 0"), [Cell::Occupied, Cell::Free]);
         let yaml = YAML.replace("negate: 0", "negate: true");
         assert_eq!(cells(&yaml, b"P2 1 1 255 255"), [Cell::Occupied]);
+    }
+
+    #[test]
+    fn values_may_be_quoted_and_modes_capital() {
+        for (from, to) in [
+            ("negate: 0", "negate: \"0\""),
+            ("negate: 0", "negate: 'no'"),
+            ("negate: 0", "negate: False"),
+            ("negate: 0", "negate: 0\nmode: Trinary"),
+            ("0.05", "\"0.05\""),
+            ("[1.0, 2.0, 3.1]", "['1', \"2.0\", 3.1]"),
+            ("0.65", "'0.65'"),
+        ] {
+            let yaml = YAML.replace(from, to);
+            let grid = OccupancyGrid::from_parts(&yaml, b"P2 2 1 255 0 255").expect("a valid map");
+            assert_eq!(grid.cells, [Cell::Occupied, Cell::Free], "{to}");
+            assert!((grid.resolution - 0.05).abs() < 1e-12 && (grid.origin.x - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn of_a_key_given_twice_the_first_counts() {
+        let metadata = MapMetadata::parse("map.yaml", &format!("{YAML}resolution: 0.1\nn_obs: 4\n"));
+        assert!((metadata.expect("a valid map").resolution - 0.05).abs() < 1e-12);
+    }
+
+    #[test]
+    fn of_two_images_the_one_that_exists_is_read() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let yaml = folder.path().join("map.yaml");
+        fs::write(&yaml, format!("image: old.pgm\n{YAML}")).expect("writable");
+        fs::write(folder.path().join("map.pgm"), b"P2 1 1 255 0").expect("writable");
+        let grid = OccupancyGrid::load(&yaml).expect("the second image is there");
+        assert_eq!(grid.cells, [Cell::Occupied]);
+        fs::write(folder.path().join("old.pgm"), b"P2 1 1 255 255").expect("writable");
+        let grid = OccupancyGrid::load(&yaml).expect("both images are there");
+        assert_eq!(grid.cells, [Cell::Free]);
+    }
+
+    #[test]
+    fn a_tilde_is_the_home_folder() {
+        let resolve = |image, home: Option<&str>| {
+            resolve("map.yaml", Path::new("/maps"), image, home.map(PathBuf::from))
+        };
+        let paths = [
+            ("~/hall/map.png", "/home/ann/hall/map.png"),
+            ("hall/map.png", "/maps/hall/map.png"),
+            ("/srv/map.png", "/srv/map.png"),
+        ];
+        for (image, path) in paths {
+            assert_eq!(
+                resolve(image, Some("/home/ann")).expect("a path"),
+                Path::new(path)
+            );
+        }
+        let error = resolve("~/map.png", None).expect_err("no home");
+        assert!(
+            error.to_string().starts_with("map.yaml: image: ~/map.png: "),
+            "{error}"
+        );
     }
 
     #[test]
@@ -312,9 +444,13 @@ mod tests {
             (
                 "resolution: 0.05",
                 "resolution: .nan",
-                "map.yaml: resolution: NaN",
+                "map.yaml: resolution: \".nan\" is not a number",
             ),
-            ("resolution: 0.05", "resolution: five", "map.yaml: "),
+            (
+                "resolution: 0.05",
+                "resolution: five",
+                "map.yaml: resolution: \"five\" is not a number",
+            ),
             ("image: map.pgm", "", "map.yaml: image: missing"),
             ("[1.0, 2.0, 3.1]", "[1.0, 2.0]", "map.yaml: origin: "),
             ("[1.0, 2.0, 3.1]", "[1.0, .inf, 0]", "map.yaml: origin: "),

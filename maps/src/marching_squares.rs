@@ -12,7 +12,7 @@ pub struct Crossing {
     pub positive: usize,
 }
 
-/// The straight pieces, at most two, in which the zero line of a function passes a square of four of its samples.
+/// The straight pieces of a function's zero line in a square of four samples: two at most.
 pub fn zero_lines(corners: [f32; 4]) -> impl Iterator<Item = [Crossing; 2]> {
     let positive = corners.map(|value| value > 0.0);
     let crossing = |edge: usize| {

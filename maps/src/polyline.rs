@@ -2,8 +2,8 @@
 
 /// A binary tree of bounding boxes over the consecutive segments of a closed polyline.
 ///
-/// Neighbours in order are neighbours in space, so halving the *index range* makes tight boxes; no sorting, and the
-/// tree is an implicit heap over blocks of [`BLOCK`] segments.
+/// Neighbours in order are neighbours in space, so halving the *index range* makes tight boxes without sorting. The tree
+/// is an implicit heap over blocks of [`BLOCK`] segments.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PolylineTree {
     /// `[min_x, min_y, max_x, max_y]`; children of `i` are `2 i` and `2 i + 1`, root at 1, leaves from `leaves` on.
@@ -16,7 +16,7 @@ pub(crate) struct PolylineTree {
 pub(crate) struct Nearest {
     /// Segment from vertex `segment` to the next one.
     pub(crate) segment: usize,
-    /// Where on the segment, in [0, 1].
+    /// Position on the segment, in [0, 1].
     pub(crate) fraction: f64,
     /// Squared distance [m^2].
     pub(crate) distance_squared: f64,
@@ -41,7 +41,7 @@ impl PolylineTree {
         Self { boxes, leaves }
     }
 
-    /// The point of the polyline nearest to `point`; `vertices` are those the tree was built from.
+    /// The point of the polyline nearest to `point`. `vertices` are those of the polyline.
     pub(crate) fn nearest(&self, vertices: &[[f64; 2]], point: [f64; 2]) -> Nearest {
         let mut best = Nearest {
             segment: 0,
@@ -79,7 +79,7 @@ impl PolylineTree {
     }
 }
 
-/// Where `point` falls on the segment from `a` to `b`, in [0, 1], and its squared distance from there.
+/// The point of the segment from `a` to `b` nearest to `point`, as a fraction in [0, 1], and its squared distance.
 fn project(a: [f64; 2], b: [f64; 2], point: [f64; 2]) -> (f64, f64) {
     let [dx, dy] = [b[0] - a[0], b[1] - a[1]];
     let [px, py] = [point[0] - a[0], point[1] - a[1]];

@@ -14,7 +14,7 @@ pub fn wrap_angle(angle: f64) -> f64 {
     }
 }
 
-/// A pose in the plane, which is also the rigid transform SE(2) that puts a frame there.
+/// A pose in the plane, or equally the rigid transform of SE(2) to its frame.
 ///
 /// Named target-from-source so that transforms chain:
 ///
@@ -36,7 +36,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// The transform that changes nothing.
+    /// The identity.
     pub const IDENTITY: Self = Self {
         x: 0.0,
         y: 0.0,
@@ -52,7 +52,7 @@ impl Pose {
         }
     }
 
-    /// The transform that undoes this one.
+    /// The inverse transform.
     #[must_use]
     pub fn inverse(self) -> Self {
         let (sin, cos) = self.heading.sin_cos();
@@ -72,7 +72,7 @@ impl Pose {
         ]
     }
 
-    /// The motion that leads from `earlier` to `self`, in the frame of `earlier`.
+    /// The motion from `earlier` to `self`, in the frame of `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         earlier.inverse() * self

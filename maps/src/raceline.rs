@@ -1,4 +1,4 @@
-//! Racelines: where the car means to drive, and how fast.
+//! Racelines: the path that the car should follow, with its speeds.
 
 use crate::polyline::PolylineTree;
 use crate::wrap_angle;
@@ -20,7 +20,7 @@ pub struct RacelinePoint {
     pub speed: f64,
 }
 
-/// Where a point is relative to a raceline.
+/// Position of a point relative to a raceline.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackPosition {
     /// Arc length of the nearest point of the line, in `[0, length)` [m].
@@ -31,10 +31,10 @@ pub struct TrackPosition {
     pub heading: f64,
 }
 
-/// What is wrong with points that should make a raceline; `index` counts from 0.
+/// Why points make no raceline; `index` counts from 0.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum RacelineFault {
-    /// Two points are no closed line.
+    /// Fewer than three points.
     #[error("{0} points where a closed line needs at least 3")]
     TooFew(usize),
     /// A NaN or an infinity.
@@ -53,7 +53,7 @@ pub enum RacelineFault {
         /// That of the point before [m].
         previous: f64,
     },
-    /// A raceline is driven forwards.
+    /// A speed is negative.
     #[error("point {index}: speed {speed} m/s is negative")]
     NegativeSpeed {
         /// Which point.
@@ -64,7 +64,7 @@ pub enum RacelineFault {
 }
 
 impl RacelineFault {
-    /// The point at fault, if it is one point's.
+    /// The point at fault, if it is a single one.
     pub fn index(&self) -> Option<usize> {
         match *self {
             Self::TooFew(_) => None,
@@ -151,7 +151,7 @@ impl Raceline {
         self.length
     }
 
-    /// Where `point` of `map` [m] is relative to the line: exact, wherever it is, in about 0.2 us.
+    /// The position of `point` of `map` [m] relative to the line: exact at any distance, in about 0.2 us.
     pub fn project(&self, point: [f64; 2]) -> TrackPosition {
         let nearest = self.tree.nearest(&self.vertices, point);
         let (from, to, span) = self.segment(nearest.segment);
@@ -164,7 +164,7 @@ impl Raceline {
         }
     }
 
-    /// The line at arc length `s` [m], which may lie outside a lap: between points, everything is interpolated.
+    /// The line at arc length `s` [m], interpolated between the points. `s` may lie outside a lap.
     pub fn at(&self, s: f64) -> RacelinePoint {
         let s = self.wrap(s);
         let index = self.points.partition_point(|p| p.s <= s).max(1) - 1;
@@ -233,7 +233,7 @@ fn check(points: &[RacelinePoint]) -> Result<(), RacelineFault> {
     Ok(())
 }
 
-/// What a closed line's positions alone say of it, at every position.
+/// Arc length, heading and curvature of a closed line, computed from its positions.
 pub(crate) struct Geometry {
     /// Length of the polyline up to here [m].
     pub(crate) s: Vec<f64>,
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn the_seam_is_no_seam() {
+    fn arc_length_is_continuous_at_the_start() {
         let line = circle(2.0, 400);
         for s in [-0.01, 0.0, 0.01, line.length() - 0.01] {
             let point = line.at(s);

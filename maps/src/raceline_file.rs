@@ -1,20 +1,12 @@
-//! Raceline files: our CSV, those of `f1tenth_racetracks`, and `race_stack`'s `global_waypoints.json`.
-//!
-//! Tools disagree on where `psi_rad` is zero (along x, or north with x to the right) and some files were made for a
-//! mirrored map, so a file's `psi_rad` is compared with the direction in which its points run: an offset of a
-//! multiple of 90 degrees is taken out, and headings that fit no convention are computed from the points instead.
+//! Raceline files: our CSV, those of other tools, and `race_stack`'s `global_waypoints.json`.
 
-use std::f64::consts::FRAC_PI_2;
 use std::fmt::Write;
 use std::path::Path;
 
 use serde::Deserialize;
 
-use crate::raceline::Geometry;
-use crate::{MapError, Raceline, RacelineFault, RacelinePoint, read_text, wrap_angle};
-
-/// Speed along a line whose file gives none (a centre line) [m/s]: what a careful driver does anywhere.
-const DEFAULT_SPEED: f64 = 2.0;
+use crate::raceline_rows::{Row, build};
+use crate::{MapError, Raceline, RacelinePoint, raceline_csv, read_text};
 
 impl Raceline {
     /// Reads a raceline file; its content tells the format.
@@ -25,28 +17,30 @@ impl Raceline {
 
     /// Reads a raceline's text, in any of the formats; `file` names it in errors.
     ///
-    /// - CSV, separated by `;` or `,`. A header (with or without `#`) names the columns, of which `x_m` and `y_m`
-    ///   must be there; `s_m psi_rad kappa_radpm vx_mps` are used, others ignored. Without a header, 6 columns or
-    ///   more are `s x y psi kappa vx`, fewer are `x y`.
-    /// - JSON with `global_traj_wpnts_iqp.wpnts` (or `global_traj_wpnts_sp.wpnts`).
+    /// - CSV, separated by `;`, `,` or white space, with a header (with or without `#`) that names the columns. `x_m` and
+    ///   `y_m` are needed; `s_m psi_rad kappa_radpm vx_mps` are used; others are ignored. Common other names of
+    ///   these columns are known, such as `X Y yaw speed`, and those of TU Munich's local planner (`x_ref_m` and its
+    ///   companions). A header without a position is refused.
+    /// - CSV without a header. Six columns or more are `s x y psi kappa vx` or `x y z qz qw v`, as their values
+    ///   show; values that fit neither are refused. Fewer columns are `x y`.
+    /// - JSON with `global_traj_wpnts_iqp.wpnts`, or `global_traj_wpnts_sp.wpnts` where the first is empty.
     ///
-    /// What a file does not give is computed from the positions; speed is then 2 m/s.
+    /// A point that repeats the one before it is left out. A line whose end is far from its start is refused. What a
+    /// file does not give is computed from the positions; speed is then 2 m/s.
     pub fn parse(file: &str, text: &str) -> Result<Self, MapError> {
-        if text.trim_start().starts_with('{') {
-            let rows = json_rows(file, text)?;
-            let n = rows.len();
-            build(&rows, true).map_err(|fault| {
-                let key = match fault.index() {
-                    Some(index) => format!("wpnts[{}]", index % n.max(1)),
-                    None => "wpnts".to_owned(),
+        if text.trim_start_matches('\u{feff}').trim_start().starts_with('{') {
+            let (key, rows) = json_rows(file, text)?;
+            build(rows).map_err(|fault| {
+                let key = match fault.place {
+                    Some(index) => format!("{key}.wpnts[{index}]"),
+                    None => format!("{key}.wpnts"),
                 };
-                MapError::key(file, &key, fault.to_string())
+                MapError::key(file, &key, fault.fault)
             })
         } else {
-            let (rows, lines, has_s) = csv_rows(file, text)?;
-            build(&rows, has_s).map_err(|fault| match fault.index().and_then(|i| lines.get(i)) {
-                Some(&line) => MapError::line(file, line, fault.to_string()),
-                None => MapError::format(file, fault.to_string()),
+            build(raceline_csv::rows(file, text)?).map_err(|fault| match fault.place {
+                Some(line) => MapError::line(file, line, fault.fault),
+                None => MapError::format(file, fault.fault),
             })
         }
     }
@@ -73,99 +67,6 @@ impl Raceline {
     }
 }
 
-/// One point as a file gives it.
-#[derive(Default, Deserialize)]
-struct Row {
-    #[serde(rename = "s_m", default)]
-    s: f64,
-    #[serde(rename = "x_m")]
-    x: f64,
-    #[serde(rename = "y_m")]
-    y: f64,
-    #[serde(rename = "psi_rad")]
-    psi: Option<f64>,
-    #[serde(rename = "kappa_radpm")]
-    kappa: Option<f64>,
-    #[serde(rename = "vx_mps")]
-    speed: Option<f64>,
-}
-
-/// Makes a line of rows, and everything that the rows do not say.
-fn build(rows: &[Row], has_s: bool) -> Result<Raceline, RacelineFault> {
-    let positions: Vec<_> = rows.iter().map(|row| [row.x, row.y]).collect();
-    let geometry = Geometry::of(open(&positions));
-    let psi: Option<Vec<f64>> = rows.iter().map(|row| row.psi).collect();
-    let headings = psi.and_then(|psi| along_travel(&psi, &geometry.heading));
-    let mirrored = {
-        let pairs = rows.iter().zip(&geometry.curvature);
-        pairs.filter_map(|(row, own)| Some(row.kappa? * own)).sum::<f64>() < 0.0
-    };
-    let n = geometry.heading.len().max(1);
-    let points = rows.iter().enumerate().map(|(i, row)| RacelinePoint {
-        s: if has_s {
-            row.s
-        } else {
-            // The closing point, if any, comes after a whole lap.
-            geometry.s.get(i).copied().unwrap_or_else(|| lap(&positions))
-        },
-        x: row.x,
-        y: row.y,
-        heading: match &headings {
-            Some(headings) => headings[i],
-            None => geometry.heading[i % n],
-        },
-        curvature: match row.kappa {
-            Some(kappa) if mirrored => -kappa,
-            Some(kappa) => kappa,
-            None => geometry.curvature[i % n],
-        },
-        speed: row.speed.unwrap_or(DEFAULT_SPEED),
-    });
-    Raceline::new(points.collect())
-}
-
-/// The positions without a last one that repeats the first.
-fn open(positions: &[[f64; 2]]) -> &[[f64; 2]] {
-    match positions {
-        [first, between @ .., last] if !between.is_empty() => {
-            let spacing = lap(positions) / positions.len() as f64;
-            let gap = (first[0] - last[0]).hypot(first[1] - last[1]);
-            if gap < 0.05 * spacing {
-                &positions[..positions.len() - 1]
-            } else {
-                positions
-            }
-        }
-        _ => positions,
-    }
-}
-
-/// Length of the polyline from the first to the last position [m].
-fn lap(positions: &[[f64; 2]]) -> f64 {
-    positions
-        .windows(2)
-        .map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]))
-        .sum()
-}
-
-/// `psi` with its zero moved to the x axis, judged by the direction of travel; None if no multiple of 90 degrees
-/// makes the two agree.
-fn along_travel(psi: &[f64], travel: &[f64]) -> Option<Vec<f64>> {
-    let (sin, cos) = psi
-        .iter()
-        .zip(travel)
-        .map(|(psi, travel)| (psi - travel).sin_cos())
-        .fold((0.0, 0.0), |sum, v| (sum.0 + v.0, sum.1 + v.1));
-    let offset = (sin.atan2(cos) / FRAC_PI_2).round() * FRAC_PI_2;
-    let disagreement: f64 = psi
-        .iter()
-        .zip(travel)
-        .map(|(psi, travel)| wrap_angle(psi - offset - travel).abs())
-        .sum();
-    // A spline's tangents and its chords differ by a few degrees in the sharpest corners.
-    (disagreement < 0.2 * psi.len() as f64).then(|| psi.iter().map(|psi| wrap_angle(psi - offset)).collect())
-}
-
 #[derive(Deserialize)]
 struct GlobalWaypoints {
     global_traj_wpnts_iqp: Option<Waypoints>,
@@ -174,80 +75,52 @@ struct GlobalWaypoints {
 
 #[derive(Deserialize)]
 struct Waypoints {
-    wpnts: Vec<Row>,
+    wpnts: Vec<Waypoint>,
 }
 
-fn json_rows(file: &str, text: &str) -> Result<Vec<Row>, MapError> {
+#[derive(Deserialize)]
+struct Waypoint {
+    s_m: Option<f64>,
+    x_m: f64,
+    y_m: f64,
+    psi_rad: Option<f64>,
+    kappa_radpm: Option<f64>,
+    vx_mps: Option<f64>,
+}
+
+/// The rows of the first trajectory that has any, and its key.
+fn json_rows(file: &str, text: &str) -> Result<(&'static str, Vec<Row>), MapError> {
+    let text = text.trim_start_matches('\u{feff}');
     let all: GlobalWaypoints =
         serde_json::from_str(text).map_err(|e| MapError::format(file, e.to_string()))?;
-    all.global_traj_wpnts_iqp
-        .or(all.global_traj_wpnts_sp)
-        .map(|waypoints| waypoints.wpnts)
-        .ok_or_else(|| MapError::key(file, "global_traj_wpnts_iqp", "missing"))
-}
-
-/// Rows, the line each stands in, and whether arc length is among the columns.
-fn csv_rows(file: &str, text: &str) -> Result<(Vec<Row>, Vec<u64>, bool), MapError> {
-    const RACELINE: [&str; 6] = ["s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps"];
-    let mut columns: Option<Vec<String>> = None;
-    let mut rows = Vec::new();
-    let mut lines = Vec::new();
-    let mut has_s = false;
-    for (line, text) in (1..).zip(text.lines()) {
-        let text = text.trim();
-        let content = text.trim_start_matches('#').trim();
-        let fields: Vec<&str> = content
-            .split(if content.contains(';') { ';' } else { ',' })
-            .map(str::trim)
-            .collect();
-        if content.is_empty() {
-            continue;
-        }
-        if fields.contains(&"x_m") && fields.contains(&"y_m") {
-            columns = Some(fields.iter().map(ToString::to_string).collect());
-            continue;
-        }
-        if text.starts_with('#') {
-            continue;
-        }
-        let columns = columns.get_or_insert_with(|| {
-            let names = if fields.len() >= RACELINE.len() {
-                &RACELINE[..]
-            } else {
-                &RACELINE[1..3]
-            };
-            names.iter().map(ToString::to_string).collect()
-        });
-        let value = |name: &str| -> Result<Option<f64>, MapError> {
-            let Some(column) = columns.iter().position(|column| column == name) else {
-                return Ok(None);
-            };
-            let field = fields.get(column).copied().unwrap_or_default();
-            field
-                .parse()
-                .map(Some)
-                .map_err(|_| MapError::line(file, line, format!("{name}: {field:?} is not a number")))
-        };
-        let s = value("s_m")?;
-        has_s = s.is_some();
-        rows.push(Row {
-            s: s.unwrap_or_default(),
-            x: value("x_m")?.unwrap_or(f64::NAN),
-            y: value("y_m")?.unwrap_or(f64::NAN),
-            psi: value("psi_rad")?,
-            kappa: value("kappa_radpm")?,
-            speed: value("vx_mps")?,
-        });
-        lines.push(line);
-    }
-    Ok((rows, lines, has_s))
+    let row = |(place, waypoint): (u64, Waypoint)| Row {
+        place,
+        s: waypoint.s_m,
+        position: [waypoint.x_m, waypoint.y_m],
+        psi: waypoint.psi_rad,
+        kappa: waypoint.kappa_radpm,
+        speed: waypoint.vx_mps,
+    };
+    [
+        ("global_traj_wpnts_iqp", all.global_traj_wpnts_iqp),
+        ("global_traj_wpnts_sp", all.global_traj_wpnts_sp),
+    ]
+    .into_iter()
+    .filter_map(|(key, waypoints)| Some((key, waypoints?.wpnts)))
+    .find(|(_, waypoints)| !waypoints.is_empty())
+    .map(|(key, waypoints)| (key, (0..).zip(waypoints).map(row).collect()))
+    .ok_or_else(|| {
+        let fault = "no waypoints, nor in global_traj_wpnts_sp";
+        MapError::key(file, "global_traj_wpnts_iqp", fault)
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wrap_angle;
     use proptest::prelude::*;
-    use std::f64::consts::{PI, TAU};
+    use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
     /// A counter-clockwise circle of radius 3 m in our own format.
     fn circle(psi: impl Fn(f64) -> f64, kappa: f64) -> String {
@@ -333,6 +206,11 @@ mod tests {
         let text =
             serde_json::json!({ "map_info_str": {"data": ""}, "global_traj_wpnts_iqp": {"wpnts": points} });
         assert_is_the_circle(&Raceline::parse("test", &text.to_string()).expect("a valid line"));
+        // Where the optimisation gave nothing, the shortest path counts.
+        let text = serde_json::json!({
+            "global_traj_wpnts_iqp": {"wpnts": []}, "global_traj_wpnts_sp": {"wpnts": text["global_traj_wpnts_iqp"]["wpnts"]}
+        });
+        assert_is_the_circle(&Raceline::parse("test", &text.to_string()).expect("a valid line"));
     }
 
     #[test]
@@ -353,12 +231,16 @@ mod tests {
             ("", "line.csv: 0 points"),
             ("1,2\n", "line.csv: 1 points"),
             ("{", "line.csv: "),
-            ("{}", "line.csv: global_traj_wpnts_iqp: missing"),
+            ("{}", "line.csv: global_traj_wpnts_iqp: no waypoints"),
             (
                 "{\"global_traj_wpnts_iqp\": {\"wpnts\": []}}",
-                "line.csv: wpnts: 0 points",
+                "line.csv: global_traj_wpnts_iqp: no waypoints",
             ),
-            ("no, line\n", "line.csv, line 1: x_m: \"no\""),
+            (
+                "{\"global_traj_wpnts_sp\": {\"wpnts\": [{\"x_m\": 1, \"y_m\": 2}]}}",
+                "line.csv: global_traj_wpnts_sp.wpnts: 1 points",
+            ),
+            ("1, line\n", "line.csv, line 1: y_m: \"line\""),
         ] {
             let error = Raceline::parse("line.csv", text).expect_err("a fault");
             assert!(
@@ -366,6 +248,114 @@ mod tests {
                 "{error} should start with {expected}"
             );
         }
+    }
+
+    /// A circle of radius 3 m: a header, and for each of 60 points a row made of its number, angle, x and y.
+    fn rows(header: &str, row: impl Fn(usize, f64, f64, f64) -> String) -> String {
+        let rows = (0..60).map(|i| {
+            let angle = TAU * i as f64 / 60.0;
+            row(i, angle, 3.0 * angle.cos(), 3.0 * angle.sin()) + "\n"
+        });
+        format!("{header}\n{}", rows.collect::<String>())
+    }
+
+    #[test]
+    fn columns_of_other_tools() {
+        let heading = |angle: f64| wrap_angle(angle + FRAC_PI_2);
+        for text in [
+            rows("X,Y,yaw,speed", |_, a, x, y| {
+                format!("{x},{y},{},4.0", heading(a))
+            }),
+            rows("# s [m], x [m], y [m], v [m/s]", |_, a, x, y| {
+                format!("{}, {x}, {y}, 4.0", 3.0 * a)
+            }),
+            rows("x y v", |_, _, x, y| format!("{x} {y} 4.0")),
+            // The local planner of TU Munich: the reference line lies 0.2 m inside, its normals point inwards.
+            rows(
+                "# 1111-aaaa\n# 2222\n# x_ref_m; y_ref_m; width_right_m; width_left_m; x_normvec_m; y_normvec_m; alpha_m; \
+                 s_racetraj_m; psi_racetraj_rad; kappa_racetraj_radpm; vx_racetraj_mps; ax_racetraj_mps2",
+                |_, a, x, y| {
+                    let (nx, ny) = (-x / 3.0, -y / 3.0);
+                    let (rx, ry) = (x + 0.2 * nx, y + 0.2 * ny);
+                    format!(
+                        "{rx}; {ry}; 1.1; 1.1; {nx}; {ny}; -0.2; {}; {}; 0.3333; 4.0; 0.0",
+                        3.0 * a,
+                        heading(a) - FRAC_PI_2
+                    )
+                },
+            ),
+            // Poses without a header: x, y, z, qz, qw, v, and with the whole quaternion.
+            rows("", |_, a, x, y| {
+                let (z, w) = (heading(a) / 2.0).sin_cos();
+                format!("{x},{y},0.0,{z},{w},4.0")
+            }),
+            rows("", |_, a, x, y| {
+                let (z, w) = (heading(a) / 2.0).sin_cos();
+                format!("{x},{y},0.0,0.0,0.0,{z},{w},4.0")
+            }),
+        ] {
+            let line = Raceline::parse("test", &text).expect("a valid line");
+            assert_is_the_circle(&line);
+            assert!(
+                line.points().iter().all(|p| (p.speed - 4.0).abs() < 1e-9),
+                "{text}"
+            );
+        }
+    }
+
+    #[test]
+    fn unknown_columns_are_refused() {
+        for (text, expected) in [
+            (
+                rows("east, north", |_, _, x, y| format!("{x}, {y}")),
+                "line.csv, line 1: x_m and y_m are not among the columns east, north",
+            ),
+            (
+                rows("# made by hand\n# east, north", |_, _, x, y| format!("{x}, {y}")),
+                "line.csv, line 2: x_m and y_m are not among the columns east, north",
+            ),
+            (
+                rows("# x_ref_m; y_ref_m; width_m", |_, _, x, y| format!("{x}; {y}; 1")),
+                "line.csv, line 1: x_m and y_m are not among the columns x_ref_m, y_ref_m, width_m",
+            ),
+            (
+                rows("", |_, a, x, y| format!("{x},{y},{a},1,2,3")),
+                "line.csv, line 2: 6 columns without a header",
+            ),
+        ] {
+            let error = Raceline::parse("line.csv", &text)
+                .expect_err("unknown columns")
+                .to_string();
+            assert!(error.starts_with(expected), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_repeated_point_is_left_out() {
+        let text = rows("x_m,y_m", |i, _, x, y| {
+            let twice = if i == 7 { 2 } else { 1 };
+            format!("{x},{y}\n").repeat(twice)
+        });
+        assert_is_the_circle(&Raceline::parse("test", &text).expect("a valid line"));
+    }
+
+    #[test]
+    fn arc_length_that_ends_with_zero_is_that_of_the_first_point() {
+        let text = rows("s_m, x_m, y_m", |_, a, x, y| format!("{}, {x}, {y}", 3.0 * a));
+        let line = Raceline::parse("test", &format!("{text}0, 3.0, 0.0\n")).expect("a valid line");
+        assert_is_the_circle(&line);
+        assert!((line.length() - 3.0 * TAU).abs() < 0.02);
+    }
+
+    #[test]
+    fn half_a_lap_is_refused() {
+        let text = rows("x_m,y_m", |_, _, x, y| format!("{x},{y}"));
+        let half: Vec<_> = text.lines().take(32).collect();
+        let error = Raceline::parse("line.csv", &half.join("\n")).expect_err("half a lap");
+        assert_eq!(
+            error.to_string(),
+            "line.csv, line 32: the line is not closed: 6.00 m from its last point back to its first, after 9.42 m"
+        );
     }
 
     #[test]

@@ -13,6 +13,14 @@ pub enum SetUpError {
         /// Cells along y.
         height: usize,
     },
+    /// Every cell of the map has the same state, so a scan cannot show where the car is.
+    #[error("the map has no wall ({width} x {height} cells)")]
+    NoWall {
+        /// Cells along x.
+        width: usize,
+        /// Cells along y.
+        height: usize,
+    },
     /// A parameter set with faults, all of them.
     #[error("parameter set refused: {}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Parameters(Vec<ParameterFault>),

@@ -47,8 +47,14 @@ const TRACK_CLEARANCE: f64 = 5.0;
 
 impl TrackMap {
     /// Builds the distance field and finds the regions. Range tables follow with `TrackMap::prepare`, or when a
-    /// localizer first needs them. Fails on a map without room for a car.
+    /// localizer first needs them. Fails on a map without walls or without room for a car.
     pub fn new(grid: OccupancyGrid) -> Result<Self, SetUpError> {
+        if !grid.has_wall() {
+            return Err(SetUpError::NoWall {
+                width: grid.width,
+                height: grid.height,
+            });
+        }
         let field = DistanceField::new(&grid);
         let (regions, region_of) = regions(&grid, &field);
         if regions.is_empty() {
@@ -246,4 +252,18 @@ fn regions(grid: &OccupancyGrid, field: &DistanceField) -> (Vec<Region>, Vec<u16
         });
     }
     (regions, region_of)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_without_walls_is_refused() {
+        for cell in [Cell::Free, Cell::Unknown] {
+            let grid = OccupancyGrid::new(40, 30, 0.05, Pose::IDENTITY, vec![cell; 40 * 30]);
+            let error = TrackMap::new(grid).expect_err("no wall");
+            assert_eq!(error.to_string(), "the map has no wall (40 x 30 cells)");
+        }
+    }
 }

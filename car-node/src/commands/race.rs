@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use car_node::race::{CarResult, Guide, MeanSigma, PAPER_ROWS, Quality, RaceSetup, RaceSummary, race};
+use car_node::race::{
+    CarResult, Guide, MeanSigma, PAPER_ROWS, Quality, RaceSetup, RaceSummary, SPEED_SCALE, race,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -242,7 +244,11 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
             crashes(s),
         );
     }
-    say!("the paper, table I (10 laps of a real car on its own track):");
+    say!(
+        "lap times are calibrated: {SPEED_SCALE} of the raceline's speed on all tyres gives the paper's on clean ones; compare with \
+         the rows of the truth"
+    );
+    say!("the paper, table I (10 laps of a real car on its own track, both tyres at one speed scaling):");
     for row in PAPER_ROWS {
         let pair = |[mean, sigma]: [f64; 2]| Some(MeanSigma { mean, sigma });
         say!(

@@ -5,7 +5,8 @@ use serde::Serialize;
 use super::Quality;
 
 /// A row of table I of *Robustness Evaluation of Localization Techniques for Autonomous Racing* (Lim et al., DATE 2024,
-/// arXiv 2401.07658): ten laps of a real car.
+/// arXiv 2401.07658): ten laps of a real car. The speed scaling was the same on both tyres, as [`SPEED_SCALE`](super::SPEED_SCALE)
+/// is here.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PaperRow {
     /// Which localizer.

@@ -1,7 +1,8 @@
-//! Motion models: how a particle moves when odometry says that the car did.
+//! Motion models: how a particle moves when odometry reports a motion.
 //!
-//! All four are signed, and their noise depends on the motion and the time, not on how many messages it came in:
-//! the alphas act on the motion per [`MotionParameters::noise_interval`], and variances add up over the intervals.
+//! All four keep the sign of the motion. Their noise depends on the motion and its duration, not on the number of
+//! messages that it came in: the parameters refer to the motion in one [`MotionParameters::noise_interval`], and the
+//! variances of the intervals add up.
 
 use maps::Pose;
 use serde::{Deserialize, Serialize};
@@ -13,14 +14,15 @@ use crate::validation::Check;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MotionModel {
-    /// Rotate, drive, rotate, with a rotation noise that shrinks with speed (Stahl et al., IV 2019): a fast car
-    /// cannot turn on the spot.
+    /// Rotate, drive, rotate. The rotation noise falls with speed, because a fast car cannot turn on the spot (Stahl et
+    /// al., IV 2019).
     Tum,
-    /// Rotate, drive, rotate (Probabilistic Robotics, table 5.6), as in AMCL.
+    /// Rotate, drive, rotate (Probabilistic Robotics, table 5.6; AMCL's `diff-corrected`).
     Amcl,
-    /// Noise on forward, sideways and turning motion, the sideways noise growing with the distance driven.
+    /// Noise on forward, sideways and turning motion; the sideways noise grows with the distance driven (the reference's
+    /// `arc`).
     Arc,
-    /// Noise on forward, sideways and turning motion, in proportion or constant (Walsh and Karaman, ICRA 2018).
+    /// Constant noise on forward, sideways and turning motion (Walsh and Karaman, ICRA 2018).
     Mit,
 }
 
@@ -30,66 +32,67 @@ pub enum MotionModel {
 pub struct MotionParameters {
     /// Which model.
     pub motion_model: MotionModel,
-    /// The interval that the alphas and dispersions refer to [s]: one message of 50 Hz odometry.
+    /// The interval that the parameters of the four models refer to [s]: one message of odometry at 50 Hz.
     pub noise_interval: f64,
-    /// `tum`: rotation noise from rotation [rad/rad].
+    /// `tum`: standard deviation of a rotation per rotation [rad/rad] (Stahl et al., IV 2019, as all of `tum`).
     pub alpha_1_tum: f64,
-    /// `tum`: rotation noise from slowness [rad m].
+    /// `tum`: standard deviation of a rotation times the translation per interval [rad m].
     pub alpha_2_tum: f64,
-    /// `tum`: translation noise from translation [m/m].
+    /// `tum`: standard deviation of the translation per translation [m/m].
     pub alpha_3_tum: f64,
-    /// `tum`: translation noise from rotation [m/rad].
+    /// `tum`: standard deviation of the translation per rotation [m/rad].
     pub alpha_4_tum: f64,
-    /// `tum`: translation per interval below which `alpha_2_tum` stops growing [m].
+    /// `tum`: least translation per interval that `alpha_2_tum` is divided by [m].
     pub lam_thresh: f64,
-    /// `amcl`: rotation noise from rotation [rad/rad].
+    /// `amcl`: variance of a rotation per squared rotation [rad^2/rad^2] (table 5.6, and AMCL's `alpha1`). The reference
+    /// adds standard deviations instead of variances, so its values have to be squared; this goes for all four.
     pub alpha_1_amcl: f64,
-    /// `amcl`: rotation noise from translation [rad/m].
+    /// `amcl`: variance of a rotation per squared translation [rad^2/m^2] (AMCL's `alpha2`).
     pub alpha_2_amcl: f64,
-    /// `amcl`: translation noise from translation [m/m].
+    /// `amcl`: variance of the translation per squared translation [m^2/m^2] (AMCL's `alpha3`).
     pub alpha_3_amcl: f64,
-    /// `amcl`: translation noise from rotation [m/rad].
+    /// `amcl`: variance of the translation per squared rotation [m^2/rad^2] (AMCL's `alpha4`). AMCL's `alpha5` belongs to
+    /// its model of omnidirectional robots.
     pub alpha_4_amcl: f64,
-    /// `arc`: forward noise from forward motion [m/m].
+    /// `arc`: standard deviation of the forward motion per forward motion [m/m] (all of `arc` as in the reference's file).
     pub motion_dispersion_arc_x: f64,
-    /// `arc`: sideways noise from sideways motion [m/m].
+    /// `arc`: standard deviation of the sideways motion per sideways motion [m/m].
     pub motion_dispersion_arc_y: f64,
-    /// `arc`: turning noise from turning [rad/rad].
+    /// `arc`: standard deviation of the turn per turn [rad/rad].
     pub motion_dispersion_arc_theta: f64,
-    /// `arc`: sideways noise from forward motion [m/m].
+    /// `arc`: standard deviation of the sideways motion per forward motion [m/m].
     pub motion_dispersion_arc_xy: f64,
-    /// `arc`: least forward noise [m].
+    /// `arc`: least standard deviation of the forward motion [m].
     pub motion_dispersion_arc_x_min: f64,
-    /// `arc`: least sideways noise [m].
+    /// `arc`: least standard deviation of the sideways motion [m].
     pub motion_dispersion_arc_y_min: f64,
-    /// `arc`: most sideways noise [m].
+    /// `arc`: greatest standard deviation of the sideways motion [m].
     pub motion_dispersion_arc_y_max: f64,
-    /// `arc`: least turning noise [rad].
+    /// `arc`: least standard deviation of the turn [rad].
     pub motion_dispersion_arc_theta_min: f64,
-    /// `arc`: forward motion below which it adds no sideways noise [m].
+    /// `arc`: forward motion per interval up to which `motion_dispersion_arc_xy` adds nothing [m].
     pub motion_dispersion_arc_xy_min_x: f64,
-    /// `mit`: forward noise [m].
+    /// `mit`: standard deviation of the forward motion [m] (all of `mit` as in MIT's particle filter).
     pub motion_dispersion_x: f64,
-    /// `mit`: sideways noise [m].
+    /// `mit`: standard deviation of the sideways motion [m].
     pub motion_dispersion_y: f64,
-    /// `mit`: turning noise [rad].
+    /// `mit`: standard deviation of the turn [rad].
     pub motion_dispersion_theta: f64,
-    /// Noise on the position that is always there [m/sqrt(s)], so that particles never become one.
+    /// Noise on the position that every model adds [m/sqrt(s)], so that copies of a particle separate.
     pub diffusion_xy: f64,
-    /// Noise on the heading that is always there [rad/sqrt(s)].
+    /// Noise on the heading that every model adds [rad/sqrt(s)].
     pub diffusion_heading: f64,
-    /// How far odometry's speed may be off beyond the slip that was learned, as a share of it [m/m]; for the refined
-    /// estimate.
+    /// Error of odometry's speed that remains once slip is learned, as a share of the speed [m/m]; for the fitted estimate.
     pub odometry_speed_error: f64,
-    /// Sideways motion that odometry does not see, as a share of the distance [m/m]; for the refined estimate.
+    /// Sideways motion that odometry misses, as a share of the distance [m/m]; for the fitted estimate.
     pub odometry_side_error: f64,
-    /// How far odometry's turning may be off, as a share of it [rad/rad]; for the refined estimate.
+    /// Error of odometry's turn as a share of the turn [rad/rad]; for the fitted estimate.
     pub odometry_yaw_error: f64,
-    /// Learn the wheels' slip where the walls tell the place, and take it out of odometry; for the refined estimate.
+    /// Learn the wheels' slip where the scan fixes the position, and correct odometry by it; for the fitted estimate.
     pub learn_slip: bool,
-    /// Let the noise grow with the slip that the filter sees.
+    /// Let the noise grow with the estimated slip.
     pub adaptive: bool,
-    /// Turn by the gyroscope's yaw rate, where there is one, in place of odometry's.
+    /// Turn by the gyroscope's yaw rate instead of odometry's where there is a gyroscope.
     pub use_imu: bool,
 }
 
@@ -103,10 +106,10 @@ impl Default for MotionParameters {
             alpha_3_tum: 0.3,
             alpha_4_tum: 0.05,
             lam_thresh: 0.1,
-            alpha_1_amcl: 0.5,
-            alpha_2_amcl: 0.5,
-            alpha_3_amcl: 0.3,
-            alpha_4_amcl: 0.1,
+            alpha_1_amcl: 0.25,
+            alpha_2_amcl: 0.25,
+            alpha_3_amcl: 0.09,
+            alpha_4_amcl: 0.01,
             motion_dispersion_arc_x: 0.3,
             motion_dispersion_arc_y: 0.5,
             motion_dispersion_arc_theta: 0.5,
@@ -173,7 +176,7 @@ impl MotionParameters {
     }
 }
 
-/// The distribution of one motion, ready to be drawn from once per particle.
+/// The distribution of one motion, from which each particle draws its own.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Motion {
     /// Turn by `rot1`, drive `trans` along the new heading, turn by `rot2`.
@@ -193,7 +196,7 @@ pub(crate) enum Motion {
 }
 
 impl Motion {
-    /// The motion `delta` of `base_link` over `dt` [s]. `widen` scales the noise (1 as tuned).
+    /// The motion `delta` of `base_link` over `dt` [s]. `widen` scales the noise of the model; 1 leaves it as tuned.
     pub(crate) fn new(
         delta: Pose,
         dt: f64,
@@ -201,7 +204,7 @@ impl Motion {
         parameters: &MotionParameters,
         defects: Defects,
     ) -> Self {
-        // Variances add up over the intervals; each interval sees its share of the motion.
+        // Each interval has its share of the motion, and the variances of the intervals add up.
         let intervals = if defects.defect_noise_per_message {
             1.0
         } else {
@@ -224,10 +227,12 @@ impl Motion {
                         parameters.alpha_3_tum * step + parameters.alpha_4_tum * (turn1 + turn2),
                     )
                 } else {
+                    let p = parameters;
+                    let [turn1, turn2, step] = [turn1, turn2, step].map(|v| v * v);
                     (
-                        parameters.alpha_1_amcl * turn1 + parameters.alpha_2_amcl * step,
-                        parameters.alpha_1_amcl * turn2 + parameters.alpha_2_amcl * step,
-                        parameters.alpha_3_amcl * step + parameters.alpha_4_amcl * (turn1 + turn2),
+                        (p.alpha_1_amcl * turn1 + p.alpha_2_amcl * step).sqrt(),
+                        (p.alpha_1_amcl * turn2 + p.alpha_2_amcl * step).sqrt(),
+                        (p.alpha_3_amcl * step + p.alpha_4_amcl * (turn1 + turn2)).sqrt(),
                     )
                 };
                 let mut mean = [rot1, trans, rot2];
@@ -285,8 +290,10 @@ impl Motion {
     }
 }
 
-/// A motion as a turn, a straight and a turn (Probabilistic Robotics, table 5.6), signed: a car that reverses
-/// drives a negative straight, and one that hardly moves turns once.
+/// A motion as a rotation, a translation and a rotation (Probabilistic Robotics, table 5.6).
+///
+/// A car that reverses has a negative translation, where the table turns the car around and back. A car that hardly
+/// moves has one rotation.
 fn rotate_drive_rotate(delta: Pose) -> (f64, f64, f64) {
     let distance = delta.x.hypot(delta.y);
     if distance < 1e-4 {
@@ -352,6 +359,44 @@ mod tests {
                     "{model:?} {delta:?}"
                 );
             }
+        }
+    }
+
+    /// `amcl` used to add standard deviations where table 5.6 and AMCL add variances.
+    #[test]
+    fn amcl_adds_variances_as_table_5_6_does() {
+        // sample(b^2) of the table has the variance b^2. A turn of 0.3 rad, 0.4 m straight on, a turn of -0.1 rad:
+        let (rot1, trans, rot2) = (0.3f64, 0.4f64, -0.1f64);
+        let delta = Pose::new(trans * rot1.cos(), trans * rot1.sin(), rot1 + rot2);
+        let parameters = MotionParameters {
+            motion_model: MotionModel::Amcl,
+            alpha_1_amcl: 0.2,
+            alpha_2_amcl: 0.3,
+            alpha_3_amcl: 0.5,
+            alpha_4_amcl: 0.7,
+            diffusion_xy: 0.0,
+            diffusion_heading: 0.0,
+            ..MotionParameters::default()
+        };
+        let Motion::Polar { sigma, .. } = Motion::new(
+            delta,
+            parameters.noise_interval,
+            1.0,
+            &parameters,
+            Defects::default(),
+        ) else {
+            panic!("rotate, drive, rotate");
+        };
+        let expected = [
+            0.2 * rot1 * rot1 + 0.3 * trans * trans,
+            0.5 * trans * trans + 0.7 * (rot1 * rot1 + rot2 * rot2),
+            0.2 * rot2 * rot2 + 0.3 * trans * trans,
+        ];
+        for (sigma, variance) in sigma.into_iter().zip(expected) {
+            assert!(
+                (f64::from(sigma).powi(2) / variance - 1.0).abs() < 1e-5,
+                "{sigma}"
+            );
         }
     }
 

@@ -87,7 +87,10 @@ pub struct Update {
     pub long_beams: f64,
     /// Share of the beams without a return.
     pub no_return: f64,
-    /// `w_fast / w_slow` of augmented MCL (Probabilistic Robotics, table 8.3); 1 when all is as usual.
+    /// Short-term over long-term average of how well the scan fits the map at the estimate; 1 when all is as usual.
+    ///
+    /// The two averages are those of augmented MCL (Probabilistic Robotics, table 8.3), but taken over the alignment of the
+    /// beams that end at no obstacle, where the table takes the mean likelihood of the particles.
     pub w_ratio: f64,
     /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
     pub innovation: [f64; 2],

@@ -18,7 +18,7 @@ pub struct Metrics {
     pub no_return: f64,
     /// Effective sample size over the number of particles, in [0, 1].
     pub ess_ratio: f64,
-    /// `w_fast / w_slow`; 1 when all is as usual.
+    /// Short-term over long-term average of the fit of the scan; 1 when all is as usual.
     pub w_ratio: f64,
     /// Standard deviation of the particles along the track [m].
     pub spread_along: f64,

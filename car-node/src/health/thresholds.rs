@@ -37,7 +37,7 @@ pub struct Thresholds {
     /// Effective sample size over the number of particles below this is worth saying. It degrades nothing: with slipping
     /// wheels it is this low for seconds while the fitted pose is right to a centimetre.
     pub ess_info: f64,
-    /// `w_fast / w_slow` below this is worth saying. It follows alignment, and so is no evidence of its own.
+    /// A `w_ratio` below this is reported. It is computed from the alignment, so it is no evidence beside it.
     pub w_ratio_info: f64,
     /// Spread across the track above this is degraded [m].
     pub spread_across_degraded: f64,

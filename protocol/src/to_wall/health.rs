@@ -212,7 +212,7 @@ pub struct Metrics {
     pub no_return: f32,
     /// Effective sample size over the number of particles, before resampling, in `[0, 1]`.
     pub ess_ratio: f32,
-    /// `w_fast / w_slow` of augmented Monte-Carlo localization; 1 when all is as usual.
+    /// Short-term over long-term average of how well the scan fits the map at the estimate; 1 when all is as usual.
     pub w_ratio: f32,
     /// Standard deviation of the particles along the track [m].
     pub spread_along: f32,

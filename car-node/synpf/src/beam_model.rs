@@ -3,13 +3,15 @@
 use maps::{DistanceField, Pose};
 use wide::f32x8;
 
+use crate::beam_layout::MOST_BEAMS;
+use crate::cddt::DIRECTIONS;
 use crate::defects::Defects;
 use crate::particles::Particles;
 use crate::pose_array::{PoseArray, load};
 use crate::preprocessed_scan::Beam;
-use crate::range_table::{DIRECTIONS, RangeTable, UNIT};
+use crate::range_table::{RangeTable, UNIT};
 use crate::ranges::Ranges;
-use crate::sensor_model::{MOST_BEAMS, SensorParameters};
+use crate::sensor_parameters::SensorParameters;
 
 /// A step of the model is this power of two of the range table's units: 2 cm.
 const STEP_SHIFT: u32 = 3;
@@ -113,7 +115,7 @@ impl BeamModel {
                 2048 => reweight_by_table::<2048>(particles, beams, &laser, table, self),
                 _ => reweight_by_table::<{ ROW_LENGTHS[2] }>(particles, beams, &laser, table, self),
             },
-            Ranges::RayMarching => {
+            Ranges::RayMarching | Ranges::Interim => {
                 reweight_by_casting(particles, beams, &laser, field, self, |from, angle, longest| {
                     field.trace(from, [angle.cos(), angle.sin()], longest)
                 });

@@ -1,16 +1,17 @@
-//! Ranges by lanes: a compressed directional distance transform, made exact.
+//! A compressed directional distance transform, CDDT (Walsh and Karaman, ICRA 2018).
 //!
-//! After Walsh and Karaman (ICRA 2018): for each direction the walls are projected onto parallel lanes, and each
-//! lane keeps the sorted places where it meets a wall; a range is one search. Directions half a turn apart share
-//! their lanes. Where the paper keeps cells, we keep crossings with the walls' faces (the contour of the distance
-//! field) and the face's slope there, so that a range is right to a fraction of a cell. The range table is filled
-//! from the same lanes, which is some ten times faster than casting its rays one by one.
+//! For each direction, parallel lanes are laid over the map. Each lane keeps the sorted places where its middle line
+//! crosses a wall's face, and a range is a search in one lane. Opposite directions share their lanes. The paper keeps
+//! occupied cells. We keep crossings with the faces (the contour of the distance field) and the face's slope there, so
+//! that a range is right to a fraction of a cell; `ranges.rs` states to which. The range table is filled from the same
+//! lanes, some ten times faster than by casting its rays one by one.
 
 use maps::DistanceField;
 use rayon::prelude::*;
 use wide::f32x4;
 
-use crate::range_table::DIRECTIONS;
+/// Directions over a full turn; a power of two, so that headings wrap with a mask.
+pub(crate) const DIRECTIONS: usize = 256;
 
 /// Directions over half a turn.
 pub(crate) const HALF_TURN: usize = DIRECTIONS / 2;
@@ -41,25 +42,46 @@ impl Cddt {
         if k < HALF_TURN { ahead } else { behind }.min(longest)
     }
 
+    /// An upper bound of the memory that a CDDT of a field takes [bytes], known before it is built.
+    pub(crate) fn bytes_at_most(field: &DistanceField) -> usize {
+        let faces = field.contour();
+        // A face of length l crosses the middles of at most l lanes, and one more.
+        let crossings = |[a, b]: &[[f32; 2]; 2]| ((a[0] - b[0]).hypot(a[1] - b[1]) * FINE) as usize + 1;
+        let crossings: usize = faces.iter().map(crossings).sum();
+        let mut reach = [f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY];
+        for [x, y] in faces.into_iter().flatten() {
+            reach = [reach[0].min(x), reach[1].min(y), reach[2].max(x), reach[3].max(y)];
+        }
+        let diagonal = (reach[2] - reach[0]).hypot(reach[3] - reach[1]);
+        let lanes = if diagonal.is_finite() {
+            (diagonal * FINE) as usize + 4
+        } else {
+            4
+        };
+        // Two slots at the infinities, and up to three more to fill a block.
+        let blocks = crossings.div_ceil(4) + 2 * lanes;
+        HALF_TURN * (blocks * size_of::<CrossingBlock>() + (lanes + 1) * size_of::<u32>())
+    }
+
     /// Memory that it takes [bytes].
     pub(crate) fn bytes(&self) -> usize {
-        let bytes = |lanes: &CddtSlice| size_of_val(&*lanes.starts) + size_of_val(&*lanes.fours);
+        let bytes = |slice: &CddtSlice| size_of_val(&*slice.starts) + size_of_val(&*slice.blocks);
         self.directions.iter().map(bytes).sum()
     }
 }
 
-/// The walls as seen along one direction.
+/// The crossings with faces along one direction.
 #[derive(Debug)]
 pub(crate) struct CddtSlice {
     /// Unit vector along the lanes.
     along: [f32; 2],
-    /// Offset across the lanes of lane 0 [lanes].
+    /// Offset of lane 0 across the lanes [lanes].
     first: f32,
-    /// Where each lane begins in `fours`; one more at the end.
+    /// Where each lane begins in `blocks`; one more at the end.
     starts: Vec<u32>,
-    /// Crossings of the lanes' middles with faces, sorted along each lane, with one at minus infinity before them
-    /// and plus infinity up to the end of the last four.
-    fours: Vec<CrossingBlock>,
+    /// Crossings of the lanes' middles with faces, sorted along each lane. Each lane starts with a crossing at minus
+    /// infinity and is filled up to whole blocks with crossings at plus infinity.
+    blocks: Vec<CrossingBlock>,
 }
 
 /// A crossing of a lane's middle with a face.
@@ -110,12 +132,12 @@ impl CddtSlice {
                 crossings.push(Crossing {
                     lane,
                     at: from + slope * (lane as f32 + 0.5 - a),
-                    // A face along the lane must not reach beyond its own half cell.
+                    // Bounds how far a face that is nearly parallel to the lane shifts within it.
                     slope: slope.clamp(-4.0, 4.0),
                 });
             }
         }
-        // Slots for every lane, with the two infinities.
+        // Slots for every lane, including its crossings at the two infinities.
         let mut starts = vec![0u32; count + 1];
         for crossing in &crossings {
             starts[crossing.lane as usize + 1] += 1;
@@ -136,18 +158,18 @@ impl CddtSlice {
             *slot += 1;
         }
         for (start, end) in starts.iter().zip(&next) {
-            // A handful, most of them in order.
+            // A handful, most of them in order already.
             sorted[4 * *start as usize..*end as usize].sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
         }
-        let four = |four: &[(f32, f32)]| CrossingBlock {
-            at: std::array::from_fn(|i| four[i].0),
-            slope: std::array::from_fn(|i| four[i].1),
+        let block = |slots: &[(f32, f32)]| CrossingBlock {
+            at: std::array::from_fn(|i| slots[i].0),
+            slope: std::array::from_fn(|i| slots[i].1),
         };
         Self {
             along,
             first,
             starts,
-            fours: sorted.chunks_exact(4).map(four).collect(),
+            blocks: sorted.chunks_exact(4).map(block).collect(),
         }
     }
 
@@ -159,27 +181,27 @@ impl CddtSlice {
         if !(lane >= 0.0 && index + 1 < self.starts.len()) {
             return [f32::INFINITY; 2];
         }
-        let fours = &self.fours[self.starts[index] as usize..self.starts[index + 1] as usize];
+        let blocks = &self.blocks[self.starts[index] as usize..self.starts[index + 1] as usize];
         let off = lane - index as f32 - 0.5;
         let at = from[0] * self.along[0] + from[1] * self.along[1];
-        // A lane meets a handful of walls, four of them compared at once.
+        // A lane crosses a handful of faces.
         let (offs, ats) = (f32x4::splat(off), f32x4::splat(at));
         let mut ahead = 0;
-        for four in fours {
-            let behind = (f32x4::from(four.at) + f32x4::from(four.slope) * offs).simd_le(ats);
+        for block in blocks {
+            let behind = (f32x4::from(block.at) + f32x4::from(block.slope) * offs).simd_le(ats);
             let count = behind.to_bitmask().trailing_ones() as usize;
             ahead += count;
             if count < 4 {
                 break;
             }
         }
-        let here = |i: usize| fours[i / 4].at[i % 4] + fours[i / 4].slope[i % 4] * off;
-        // The infinities bound the count from both sides.
+        let here = |i: usize| blocks[i / 4].at[i % 4] + blocks[i / 4].slope[i % 4] * off;
+        // The crossings at the infinities bound the indices on both sides.
         [here(ahead) - at, at - here(ahead - 1)]
     }
 }
 
-/// The least whole number not below a number that is not negative; quicker than `ceil` without SSE 4.1.
+/// Rounds a number that is not negative up; faster than `ceil` without SSE 4.1.
 fn upward(v: f32) -> u32 {
     let whole = v as u32;
     whole + u32::from((whole as f32) < v)

@@ -2,9 +2,10 @@
 
 use maps::DistanceField;
 
+use crate::beam_layout::MOST_BEAMS;
 use crate::particles::Particles;
 use crate::preprocessed_scan::PreprocessedScan;
-use crate::sensor_model::{MOST_BEAMS, SensorParameters};
+use crate::sensor_parameters::SensorParameters;
 
 /// Log-likelihoods by distance to the nearest wall, in steps of 1 cm.
 #[derive(Debug, Clone)]

@@ -20,7 +20,7 @@ use crate::motion_model::MotionParameters;
 use crate::particles::ParticleParameters;
 use crate::scan_matcher::RefinementParameters;
 use crate::search::SearchParameters;
-use crate::sensor_model::SensorParameters;
+use crate::sensor_parameters::SensorParameters;
 use crate::validation::Check;
 
 /// Everything that can be tuned.

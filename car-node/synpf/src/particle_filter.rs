@@ -70,7 +70,8 @@ impl ParticleFilter {
         let region = map.region_at(near);
         let known = self.ranges.as_ref().map(|(of, _)| *of);
         let index = region.unwrap_or_else(|| known.unwrap_or(usize::MAX));
-        if known != Some(index) {
+        let interim = matches!(self.ranges, Some((_, Ranges::Interim)));
+        if known != Some(index) || interim {
             self.ranges = Some((index, self.sensor_model.ranges(map, region, parameters)));
         }
         if let Some((_, ranges)) = &self.ranges {

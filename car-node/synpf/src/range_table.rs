@@ -4,13 +4,10 @@ use maps::{DistanceField, OccupancyGrid};
 use rayon::prelude::*;
 use wide::{f32x8, i32x8};
 
-use crate::cddt::{CddtSlice, HALF_TURN};
+use crate::cddt::{CddtSlice, DIRECTIONS, HALF_TURN};
 
-/// Directions that a table distinguishes; a power of two, so that headings wrap with a mask.
-pub(crate) const DIRECTIONS: usize = 256;
-
-/// Directions that one task of the building handles.
-const STRETCH: usize = 16;
+/// Directions that one task fills while the table is built.
+const SEGMENT: usize = 16;
 
 /// One unit of a stored range [m]; 16 bits reach 164 m.
 pub(crate) const UNIT: f32 = 0.0025;
@@ -53,7 +50,7 @@ impl RangeTable {
         let bias = if parameters.long_ranges { 0.5 } else { 0.0 };
         let stored = |range: f32| ((range + bias) * scale + 0.5) as u16;
         let faces = field.contour();
-        // On a wall's face, where grey calls a cell free, there is no laser: its ranges stay 0.
+        // A free cell may lie behind a face where the map is grey. No laser is there: its ranges stay 0.
         let centres: Vec<(usize, [f32; 2])> = cells
             .iter()
             .enumerate()
@@ -63,25 +60,25 @@ impl RangeTable {
                 (row, [column as f32 + 0.5, line as f32 + 0.5])
             })
             .collect();
-        // Each task fills a stretch of directions, and the same half a turn on, in buffers of its own.
-        let stretches: Vec<Vec<[[u16; STRETCH]; 2]>> = (0..HALF_TURN / STRETCH)
+        // Each task fills a segment of directions, and the same half a turn on, in its own buffers.
+        let segments: Vec<Vec<[[u16; SEGMENT]; 2]>> = (0..HALF_TURN / SEGMENT)
             .into_par_iter()
-            .map(|stretch| {
-                let mut part = vec![[[0; STRETCH]; 2]; cells.len()];
-                let fill = |part: &mut [[[u16; STRETCH]; 2]], k: usize| {
-                    let direction = (stretch * STRETCH + k) as f64 / DIRECTIONS as f64;
+            .map(|segment| {
+                let mut part = vec![[[0; SEGMENT]; 2]; cells.len()];
+                let fill = |part: &mut [[[u16; SEGMENT]; 2]], k: usize| {
+                    let direction = (segment * SEGMENT + k) as f64 / DIRECTIONS as f64;
                     let steps = f64::from(parameters.directions);
-                    let lanes = CddtSlice::new(
+                    let slice = CddtSlice::new(
                         &faces,
                         (direction * steps).round() / steps * std::f64::consts::TAU,
                     );
                     for &(row, centre) in &centres {
-                        let [ahead, behind] = lanes.ranges(centre);
+                        let [ahead, behind] = slice.ranges(centre);
                         part[row][0][k] = stored(ahead);
                         part[row][1][k] = stored(behind);
                     }
                 };
-                (0..STRETCH).for_each(|k| fill(&mut part, k));
+                (0..SEGMENT).for_each(|k| fill(&mut part, k));
                 part
             })
             .collect();
@@ -90,10 +87,10 @@ impl RangeTable {
             .par_chunks_mut(DIRECTIONS)
             .enumerate()
             .for_each(|(row, out)| {
-                for (stretch, part) in stretches.iter().enumerate() {
+                for (segment, part) in segments.iter().enumerate() {
                     for (half, values) in part[row].iter().enumerate() {
-                        let from = half * HALF_TURN + stretch * STRETCH;
-                        out[from..from + STRETCH].copy_from_slice(values);
+                        let from = half * HALF_TURN + segment * SEGMENT;
+                        out[from..from + SEGMENT].copy_from_slice(values);
                     }
                 }
             });
@@ -107,7 +104,12 @@ impl RangeTable {
 
     /// Memory that it takes [bytes].
     pub(crate) fn bytes(&self) -> usize {
-        self.ranges.len() * size_of::<u16>() + self.row_of.len() * size_of::<u32>()
+        size_of_val(&*self.ranges) + size_of_val(&*self.row_of)
+    }
+
+    /// Memory that a table for `region_cells` cells of a grid of `grid_cells` takes [bytes].
+    pub(crate) fn bytes_for(grid_cells: usize, region_cells: usize) -> usize {
+        region_cells * DIRECTIONS * size_of::<u16>() + (grid_cells + 1) * size_of::<u32>()
     }
 
     /// The rows for eight points in grid coordinates [cells]; see [`RangeTable::row`].
@@ -137,5 +139,14 @@ impl RangeTable {
     pub(crate) fn row(&self, row: u32) -> Option<&[u16; DIRECTIONS]> {
         let start = row as usize * DIRECTIONS;
         self.ranges.get(start..start + DIRECTIONS)?.try_into().ok()
+    }
+
+    /// Range from a point [cells] for a particle's heading and a beam's direction [m], rounded as the beam model does it.
+    #[cfg(test)]
+    pub(crate) fn range(&self, from: [f32; 2], heading: f32, beam: f32) -> Option<f32> {
+        let row = self.row(self.rows_at(f32x8::splat(from[0]), f32x8::splat(from[1]))[0])?;
+        let step = |angle: f32| (angle / std::f32::consts::TAU * DIRECTIONS as f32).round() as i64;
+        let direction = (step(heading) + step(beam)).rem_euclid(DIRECTIONS as i64);
+        Some(f32::from(row[direction as usize]) * UNIT)
     }
 }

@@ -367,7 +367,7 @@ impl SynPf {
         if !self.map.covers(pose) {
             return Err(PoseError::OffMap(pose));
         }
-        self.map.prepare(Some(pose), &self.parameters);
+        self.map.request_tables(Some(pose), &self.parameters);
         let particles = &self.parameters.particles;
         let sigma = [
             particles.initial_std_x,

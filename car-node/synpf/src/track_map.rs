@@ -1,14 +1,15 @@
 //! A map made ready for localization.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::error::SetUpError;
 use crate::range_table::{RangeTable, TableParameters};
+use crate::regions::{NOWHERE, Region, regions};
 use crate::seed::Blurred;
+use crate::table_store::{Table, TableJob, TableKey, TablePolicy, TableStore};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,
 /// which are built for the regions that a car is in and shared between threads and localizers.
@@ -23,24 +24,9 @@ pub struct TrackMap {
     regions: Vec<Region>,
     /// For each cell the index of its region; [`NOWHERE`] where it is not free.
     region_of: Vec<u16>,
-    tables: Mutex<HashMap<(usize, TableParameters), Arc<RangeTable>>>,
-    cddt: OnceLock<Arc<Cddt>>,
+    tables: TableStore,
     blurred: OnceLock<Blurred>,
 }
-
-/// A connected piece of free space.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Region {
-    /// Its cells.
-    pub(crate) cells: Vec<u32>,
-    /// Greatest distance from a wall in it [m]; small for a track, large for an infield.
-    pub(crate) clearance: f64,
-}
-
-const NOWHERE: u16 = u16::MAX;
-
-/// Regions smaller than this hold no car [m^2].
-const SMALLEST_REGION: f64 = 1.0;
 
 /// A track is nowhere wider than twice this; what is wider lies beside it [m].
 const TRACK_CLEARANCE: f64 = 5.0;
@@ -70,8 +56,7 @@ impl TrackMap {
             grid_from_map,
             regions,
             region_of,
-            tables: Mutex::default(),
-            cddt: OnceLock::new(),
+            tables: TableStore::default(),
             blurred: OnceLock::new(),
         })
     }
@@ -105,28 +90,73 @@ impl TrackMap {
         (f64::from(cells) * resolution).min(max_range)
     }
 
-    /// Memory that the range tables (and the CDDT, where a set uses it) take [bytes].
-    pub fn table_bytes(&self) -> usize {
-        let tables = self.tables.lock().unwrap_or_else(PoisonError::into_inner);
-        tables.values().map(|table| table.bytes()).sum::<usize>()
-            + self.cddt.get().map_or(0, |cddt| cddt.bytes())
+    /// The same map with another policy for tables that are missing, and without those that were built.
+    #[must_use]
+    pub fn with_table_policy(self, policy: TablePolicy) -> Self {
+        Self {
+            tables: TableStore::new(policy),
+            ..self
+        }
     }
 
-    pub(crate) fn table(&self, region: usize, parameters: TableParameters) -> Arc<RangeTable> {
-        let mut tables = self.tables.lock().unwrap_or_else(PoisonError::into_inner);
-        let build = || {
-            Arc::new(RangeTable::new(
+    /// The tables that localizers wait for, the oldest first; always empty with [`TablePolicy::BuildNow`].
+    pub fn pending_tables(&self) -> Vec<TableJob> {
+        self.tables.pending().into_iter().map(TableJob).collect()
+    }
+
+    /// Builds a table in the caller's thread, and on rayon's. It takes from some milliseconds to a second; localizers go on
+    /// meanwhile.
+    pub fn build_table(&self, job: TableJob) {
+        self.tables.build(job.0, || self.new_table(job.0));
+    }
+
+    /// Memory that the tables take [bytes].
+    pub fn table_bytes(&self) -> usize {
+        self.tables.bytes()
+    }
+
+    /// Memory that a table takes [bytes], known before it is built: exact for range tables, an upper bound for the CDDT.
+    pub(crate) fn bytes_for(&self, key: TableKey) -> usize {
+        match key {
+            TableKey::Ranges { region, .. } => {
+                RangeTable::bytes_for(self.grid.cells.len(), self.regions[region].cells.len())
+            }
+            TableKey::Cddt => Cddt::bytes_at_most(&self.field),
+        }
+    }
+
+    /// A table from a localizer's thread: built at once or made pending, by the policy.
+    pub(crate) fn table(&self, key: TableKey) -> Option<Table> {
+        self.tables.get(key, || self.new_table(key))
+    }
+
+    /// The range table of a region; None while another thread has yet to build it.
+    pub(crate) fn range_table(&self, region: usize, parameters: TableParameters) -> Option<Arc<RangeTable>> {
+        let key = TableKey::Ranges { region, parameters };
+        match self.table(key) {
+            Some(Table::Ranges(table)) => Some(table),
+            _ => None,
+        }
+    }
+
+    /// The CDDT; None while another thread has yet to build it.
+    pub(crate) fn cddt(&self) -> Option<Arc<Cddt>> {
+        match self.table(TableKey::Cddt) {
+            Some(Table::Cddt(cddt)) => Some(cddt),
+            _ => None,
+        }
+    }
+
+    fn new_table(&self, key: TableKey) -> Table {
+        match key {
+            TableKey::Ranges { region, parameters } => Table::Ranges(Arc::new(RangeTable::new(
                 &self.grid,
                 &self.field,
                 &self.regions[region].cells,
                 parameters,
-            ))
-        };
-        Arc::clone(tables.entry((region, parameters)).or_insert_with(build))
-    }
-
-    pub(crate) fn cddt(&self) -> Arc<Cddt> {
-        Arc::clone(self.cddt.get_or_init(|| Arc::new(Cddt::new(&self.field))))
+            ))),
+            TableKey::Cddt => Table::Cddt(Arc::new(Cddt::new(&self.field))),
+        }
     }
 
     /// Whether a pose in `map` lies on the grid.
@@ -205,58 +235,41 @@ impl TrackMap {
     }
 }
 
-/// Free space in pieces that a car cannot pass between.
-fn regions(grid: &OccupancyGrid, field: &DistanceField) -> (Vec<Region>, Vec<u16>) {
-    let mut region_of = vec![NOWHERE; grid.cells.len()];
-    let mut regions = Vec::new();
-    let smallest = SMALLEST_REGION / (grid.resolution * grid.resolution);
-    let mut seen = vec![false; grid.cells.len()];
-    for seed in 0..grid.cells.len() {
-        if seen[seed] || grid.cells[seed] != Cell::Free {
-            continue;
-        }
-        seen[seed] = true;
-        let (mut cells, mut next) = (vec![seed as u32], 0);
-        while next < cells.len() {
-            let i = cells[next] as usize;
-            next += 1;
-            let (column, row) = (i % grid.width, i / grid.width);
-            let neighbours = [
-                (column > 0).then(|| i - 1),
-                (column + 1 < grid.width).then(|| i + 1),
-                (row > 0).then(|| i - grid.width),
-                (row + 1 < grid.height).then(|| i + grid.width),
-            ];
-            for j in neighbours.into_iter().flatten() {
-                if !seen[j] && grid.cells[j] == Cell::Free {
-                    seen[j] = true;
-                    cells.push(j as u32);
-                }
-            }
-        }
-        if (cells.len() as f64) < smallest || regions.len() + 1 >= usize::from(NOWHERE) {
-            continue;
-        }
-        // In the order of the grid, so that neighbours in space are neighbours in a table.
-        cells.sort_unstable();
-        for &cell in &cells {
-            region_of[cell as usize] = regions.len() as u16;
-        }
-        let deepest = cells
-            .iter()
-            .map(|&cell| field.values()[cell as usize])
-            .fold(0.0, f32::max);
-        regions.push(Region {
-            cells,
-            clearance: f64::from(deepest),
-        });
-    }
-    (regions, region_of)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::{Defects, Parameters};
+
+    /// A room of 5 x 5 m.
+    fn room() -> TrackMap {
+        let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
+        let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
+        let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());
+        TrackMap::new(grid).expect("free space")
+    }
+
+    /// A table used to be built by the filter's thread that first needed it, with the lock of all tables held.
+    #[test]
+    fn a_deferred_table_is_pending_until_somebody_builds_it() {
+        let map = room().with_table_policy(TablePolicy::Defer);
+        let parameters = Parameters::default().sensor.table_parameters(Defects::default());
+        for _ in 0..3 {
+            assert!(map.range_table(0, parameters).is_none());
+        }
+        assert_eq!((map.pending_tables().len(), map.table_bytes()), (1, 0));
+        map.build_table(map.pending_tables()[0]);
+        assert!(map.range_table(0, parameters).is_some());
+        assert_eq!(map.pending_tables(), []);
+    }
+
+    #[test]
+    fn a_table_is_built_at_once_where_results_must_not_depend_on_time() {
+        let map = room();
+        let parameters = Parameters::default().sensor.table_parameters(Defects::default());
+        assert!(map.range_table(0, parameters).is_some());
+        assert!(map.cddt().is_some());
+        assert_eq!(map.pending_tables(), []);
+    }
 
     #[test]
     fn a_map_without_walls_is_refused() {

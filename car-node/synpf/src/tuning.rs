@@ -4,8 +4,9 @@ use localizer::{ParameterFault, PreparedParameters};
 use maps::Pose;
 
 use crate::parameters::Parameters;
-use crate::sensor_model::RangeMethod;
 use crate::sensor_model::SensorModel;
+use crate::sensor_parameters::{RangeMethod, SensorModelKind};
+use crate::table_store::{TableJob, TableKey};
 use crate::track_map::TrackMap;
 
 /// A parameter set with the tables that it needs. Making one takes milliseconds, swapping it in takes none.
@@ -41,22 +42,75 @@ impl Tuning {
 }
 
 impl TrackMap {
-    /// Builds the range tables that a set needs, if they are not there yet, so that the first update does not have
-    /// to: for the region around a pose in `map`, or, without one, for all that look like tracks.
+    /// Builds the tables that a set needs in the caller's thread, whatever the policy, so that no update has to wait for
+    /// them or go without: for the region around a pose in `map`, or, without one, for all that look like tracks.
     pub fn prepare(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) {
+        for key in self.needed_tables(map_from_base_link, parameters) {
+            self.build_table(TableJob(key));
+        }
+    }
+
+    /// Asks for the tables that a set needs, from a localizer's thread: builds them or makes them pending, by the policy.
+    pub(crate) fn request_tables(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) {
+        for key in self.needed_tables(map_from_base_link, parameters) {
+            self.table(key);
+        }
+    }
+
+    /// The tables that a set needs; see [`TrackMap::prepare`].
+    fn needed_tables(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) -> Vec<TableKey> {
+        if parameters.sensor.sensor_model != SensorModelKind::Beam {
+            return Vec::new();
+        }
         match parameters.sensor.range_method {
             RangeMethod::Lut => {
                 let at = map_from_base_link.map(|pose| self.region_at(self.grid_from_map() * pose));
                 let regions =
                     at.map_or_else(|| self.plausible_regions(), |region| region.into_iter().collect());
-                for region in regions {
-                    self.table(region, parameters.sensor.table_parameters(parameters.defects));
-                }
+                let parameters = parameters.sensor.table_parameters(parameters.defects);
+                let key = |region| TableKey::Ranges { region, parameters };
+                regions.into_iter().map(key).collect()
             }
-            RangeMethod::Cddt => {
-                self.cddt();
+            RangeMethod::Cddt => vec![TableKey::Cddt],
+            RangeMethod::RayMarching => Vec::new(),
+        }
+    }
+
+    /// Memory that [`TrackMap::prepare`] needs with the same arguments [bytes], known before anything is built: exact for
+    /// range tables, an upper bound for the CDDT, 0 for ray marching.
+    pub fn table_bytes_for(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) -> usize {
+        let keys = self.needed_tables(map_from_base_link, parameters);
+        keys.into_iter().map(|key| self.bytes_for(key)).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use maps::{Cell, OccupancyGrid};
+
+    /// A room of 5 x 5 m.
+    fn room() -> TrackMap {
+        let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
+        let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
+        let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());
+        TrackMap::new(grid).expect("free space")
+    }
+
+    #[test]
+    fn the_memory_of_tables_is_known_before_they_are_built() {
+        let mut set = Parameters::default();
+        for method in [RangeMethod::RayMarching, RangeMethod::Lut, RangeMethod::Cddt] {
+            set.sensor.range_method = method;
+            let map = room();
+            let announced = map.table_bytes_for(None, &set);
+            map.prepare(None, &set);
+            let taken = map.table_bytes();
+            if method == RangeMethod::Cddt {
+                assert!((taken..8 * taken).contains(&announced), "{announced} for {taken}");
+            } else {
+                assert_eq!(announced, taken, "{method:?}");
             }
-            RangeMethod::RayMarching => {}
         }
     }
 }

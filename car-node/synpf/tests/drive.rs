@@ -8,8 +8,8 @@ use common::{BASE_LINK_FROM_LASER, new_ring, odometry, ring, scan, truth};
 use maps::{Pose, wrap_angle};
 use proptest::prelude::*;
 use synpf::{
-    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModelKind, Stamp, SynPf, TrackMap, Twist,
-    Update, YawRate,
+    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModelKind, Stamp, SynPf, TablePolicy,
+    TrackMap, Twist, Update, YawRate,
 };
 
 fn localizer(map: &Arc<TrackMap>, parameters: Parameters, seed: u64) -> SynPf {
@@ -94,6 +94,41 @@ fn every_model_and_method_follows_the_track() {
             set.motion.motion_model,
             set.sensor
         );
+    }
+}
+
+/// Where tables are deferred, the filter's thread used to build them nevertheless and held a lock meanwhile.
+#[test]
+fn a_localizer_follows_while_its_table_is_built_elsewhere() {
+    for method in [RangeMethod::Lut, RangeMethod::Cddt] {
+        let map = TrackMap::new(ring().grid().clone()).expect("free space");
+        let map = Arc::new(map.with_table_policy(TablePolicy::Defer));
+        let mut set = named("hq");
+        set.sensor.range_method = method;
+        // The particles alone, without the refinement that would cover for them.
+        set.refinement.refine = false;
+        let mut localizer = localizer(&map, set, 2);
+        localizer.on_odometry(&odometry(0.0, 1.0)).expect("sound");
+        localizer.initialize(truth(0.0)).expect("finite");
+        let (mut odom, mut errors) = (0.0, Vec::new());
+        for k in 1..=80 {
+            let at = f64::from(k) * 0.025;
+            while odom + 0.02 <= at {
+                odom += 0.02;
+                localizer.on_odometry(&odometry(odom, 1.0)).expect("sound");
+            }
+            errors.push(error(&localizer.on_scan(&scan(&map, at)).expect("an update")));
+            if k == 40 {
+                assert_eq!(map.table_bytes(), 0, "the localizer built the table itself");
+                let pending = map.pending_tables();
+                assert_eq!(pending.len(), 1);
+                map.build_table(pending[0]);
+            }
+        }
+        assert_eq!(map.pending_tables(), []);
+        assert!(map.table_bytes() > 0);
+        let worst = errors[20..].iter().copied().fold(0.0, f64::max);
+        assert!(worst < 0.35, "{method:?}: {worst}");
     }
 }
 

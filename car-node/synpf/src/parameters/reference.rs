@@ -55,7 +55,7 @@ pub(super) fn translate(key: &str, value: &Value) -> Vec<(String, Value)> {
 mod tests {
     use crate::Parameters;
     use crate::motion_model::MotionModel;
-    use crate::sensor_model::RangeMethod;
+    use crate::sensor_parameters::RangeMethod;
 
     #[test]
     fn the_references_keys_are_understood() {

@@ -10,8 +10,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
-use car_node::bag::{Bag, SensorEvent, Topics};
-use car_node::frames::Mount;
+use car_node::sensors::bag::{Bag, SensorEvent, Topics};
+use car_node::sensors::frames::Mount;
 use maps::{OccupancyGrid, Pose};
 use synpf::{Parameters, SynPf, TrackMap};
 

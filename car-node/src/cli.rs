@@ -4,10 +4,10 @@
 use std::path::PathBuf;
 
 use car_node::evaluate::{Fault, Start};
-use car_node::link::endpoint;
+use car_node::network::endpoint;
 use car_node::node::Begin;
-use car_node::ros_pose;
-use car_node::source::Ros2Options;
+use car_node::ros2::pose_publisher;
+use car_node::sensors::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
@@ -81,7 +81,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 0, 232))]
     pub(crate) ros_domain: Option<u32>,
     /// With --source ros2: where to publish the pose for the car's own nodes (nav_msgs/Odometry in frame map).
-    #[arg(long, value_name = "TOPIC", default_value = ros_pose::TOPIC)]
+    #[arg(long, value_name = "TOPIC", default_value = pose_publisher::TOPIC)]
     pub(crate) pose_topic: String,
     /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
     #[arg(long, value_name = "MAP.yaml|TRACK")]
@@ -247,7 +247,7 @@ pub(crate) struct Race {
     pub(crate) params: String,
     /// What tells the driver where the car is.
     #[arg(long, value_enum, default_value = "synpf")]
-    pub(crate) localizer: Guide,
+    pub(crate) localizer: PoseSource,
     /// Cars on the track, each with a localizer of its own, 1 to 20.
     #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = |text: &str| whole::<u8>(text, 1, 20))]
     pub(crate) cars: u8,
@@ -270,7 +270,7 @@ pub(crate) struct Race {
 
 /// What the driver goes by, as an argument.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(crate) enum Guide {
+pub(crate) enum PoseSource {
     /// The filter, with the set that --params names.
     Synpf,
     /// The filter with the reference's behaviour, whatever --params says.

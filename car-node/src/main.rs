@@ -2,7 +2,6 @@
 
 mod cli;
 mod commands;
-mod drawing;
 
 use std::process::ExitCode;
 

@@ -8,10 +8,11 @@ use protocol::{
 };
 use synpf::{Hypothesis, Odometry, Scan, Twist};
 
-use crate::clock::SensorClock;
-use crate::counters::Spread;
 use crate::health::Metrics;
-use crate::outbox::{CloudSample, Fit, HealthReport, PoseEstimate, ScanPoints, TrueMotion};
+use crate::sensors::TrueMotion;
+use crate::sensors::clock::SensorClock;
+use crate::telemetry::counters::Spread;
+use crate::telemetry::queue::{BeamClass, CloudSample, HealthReport, PoseReport, ScanPoints};
 
 /// What is not finite has no place on the wire; such a number becomes 0, having been counted as bad where it
 /// arose.
@@ -61,7 +62,7 @@ fn covariance(matrix: &Matrix3<f64>) -> Covariance {
 }
 
 /// A pose estimate.
-pub fn pose_message(estimate: &PoseEstimate) -> protocol::Pose {
+pub fn pose_message(estimate: &PoseReport) -> protocol::Pose {
     protocol::Pose {
         pose: pose2(estimate.pose),
         twist: twist2(estimate.twist),
@@ -113,10 +114,10 @@ pub fn scan_view(points: &ScanPoints) -> ScanView {
             .take(ScanView::MAX_POINTS)
             .map(|(point, fit)| {
                 let kind = match fit {
-                    Fit::OnWall => EndPointKind::OnWall,
-                    Fit::OffWall => EndPointKind::OffWall,
-                    Fit::Short => EndPointKind::Short,
-                    Fit::Long => EndPointKind::Long,
+                    BeamClass::OnWall => EndPointKind::OnWall,
+                    BeamClass::OffWall => EndPointKind::OffWall,
+                    BeamClass::Short => EndPointKind::Short,
+                    BeamClass::Long => EndPointKind::Long,
                 };
                 EndPoint::quantise(*point, points.centre, kind)
             })

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use car_node::ros::{
+use car_node::ros2::messages::{
     self, Header, LaserScan, Orientation, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
 };
 use maps::Pose;
@@ -86,7 +86,7 @@ impl BagWriter {
             publish_time: log_time.0 as u64,
         };
         self.writer
-            .write_to_known_channel(&header, &ros::encode(message).expect("encodes"))
+            .write_to_known_channel(&header, &messages::encode(message).expect("encodes"))
             .expect("writes");
     }
 }

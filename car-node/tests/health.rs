@@ -5,11 +5,11 @@ use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
-use car_node::bag::{Arrival, SensorEvent, SensorLog, Topics};
 use car_node::evaluate::{self, Fault, FaultReport, Outcome, Start, Truth};
-use car_node::frames::Mount;
 use car_node::health::State;
-use car_node::source::{Belief, Feed, Next, Race, Source};
+use car_node::sensors::bag::{Arrival, SensorEvent, SensorLog, Topics};
+use car_node::sensors::frames::Mount;
+use car_node::sensors::{Feed, Next, PoseEstimate, Race, Source};
 use maps::{Cell, OccupancyGrid, Pose};
 use simulator::{CarSetup, Guidance, Surface, Track, Wall, Walls};
 use synpf::{Localizer, Parameters, SynPf, TrackMap};
@@ -38,9 +38,9 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
         truth: Vec::new(),
         topics: Topics::default(),
     };
-    let mut belief: Option<Belief> = None;
+    let mut estimate: Option<PoseEstimate> = None;
     let mut begun = None;
-    while let Next::Due(due, feed) = car.next(belief.take()) {
+    while let Next::Due(due, feed) = car.next(estimate.take()) {
         let elapsed = due.since(*begun.get_or_insert(due));
         if elapsed > seconds {
             break;
@@ -50,7 +50,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
                 match &event {
                     SensorEvent::Odometry(odometry) => {
                         localizer.on_odometry(odometry).expect("sound odometry");
-                        belief = localizer.predict(odometry.stamp).map(|pose| Belief {
+                        estimate = localizer.predict(odometry.stamp).map(|pose| PoseEstimate {
                             stamp: odometry.stamp,
                             pose,
                             twist: odometry.twist,
@@ -59,12 +59,12 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
                     SensorEvent::Scan(scan) => drop(localizer.on_scan(scan)),
                     SensorEvent::YawRate(yaw_rate) => drop(localizer.on_yaw_rate(yaw_rate)),
                 }
-                belief = belief.filter(|_| elapsed < moving);
+                estimate = estimate.filter(|_| elapsed < moving);
                 log.arrivals.push(Arrival { log_time: due, event });
             }
             Feed::Truth(truth) => log.truth.push((truth.stamp, truth.pose)),
-            Feed::Word(word) => panic!("{word}"),
-            Feed::Placed(_) => panic!("the recovery crew had to come"),
+            Feed::Log(word) => panic!("{word}"),
+            Feed::InitialPose(_) => panic!("the recovery crew had to come"),
         }
     }
     log

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use car_node::node::{Node, NodeConfig, RaceMap};
-use car_node::source::Race;
+use car_node::sensors::Race;
 use common::router;
 use protocol::{
     Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message,

@@ -8,12 +8,14 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use car_node::bag::{SensorEvent, Topics};
-use car_node::clock::wall_now;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::ros::{self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3};
-use car_node::ros_pose;
-use car_node::source::{Belief, Feed, Next, Race, Ros2, Ros2Error, Ros2Options, Source};
+use car_node::ros2::messages::{
+    self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
+};
+use car_node::ros2::pose_publisher;
+use car_node::sensors::bag::{SensorEvent, Topics};
+use car_node::sensors::clock::wall_now;
+use car_node::sensors::{Feed, Next, PoseEstimate, Race, Ros2, Ros2Error, Ros2Options, Source};
 use common::router;
 use maps::Pose;
 use serde::Serialize;
@@ -126,14 +128,14 @@ fn header(frame: &str, stamp: Stamp) -> Header {
 }
 
 fn bytes<T: Serialize>(message: &T) -> Vec<u8> {
-    ros::encode(message).expect("encodes")
+    messages::encode(message).expect("encodes")
 }
 
 /// A drive in real time, published until it is told to stop; the driver steers by what the node believes.
 struct Drive {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
-    belief: Arc<Mutex<Option<Belief>>>,
+    estimate: Arc<Mutex<Option<PoseEstimate>>>,
     truth: Arc<Mutex<Vec<(Stamp, Pose)>>>,
 }
 
@@ -143,14 +145,14 @@ fn drive(router: &Session, naming: Naming, track: &Track) -> (Drive, Pose) {
     let start = car.start().expect("known");
     let ros = RosCar::new(router, naming, car.mount().base_link_from_laser);
     let stop = Arc::<AtomicBool>::default();
-    let belief = Arc::<Mutex<Option<Belief>>>::default();
+    let estimate = Arc::<Mutex<Option<PoseEstimate>>>::default();
     let truth = Arc::<Mutex<Vec<(Stamp, Pose)>>>::default();
     let thread = thread::spawn({
-        let (stop, belief, truth) = (Arc::clone(&stop), Arc::clone(&belief), Arc::clone(&truth));
+        let (stop, estimate, truth) = (Arc::clone(&stop), Arc::clone(&estimate), Arc::clone(&truth));
         let clock = car.clock(1.0);
         move || {
             while !stop.load(Ordering::Relaxed) {
-                let latest = *belief.lock().expect("sound");
+                let latest = *estimate.lock().expect("sound");
                 let Next::Due(due, feed) = car.next(latest) else {
                     panic!("a simulator always has something")
                 };
@@ -166,7 +168,7 @@ fn drive(router: &Session, naming: Naming, track: &Track) -> (Drive, Pose) {
     let drive = Drive {
         stop,
         thread,
-        belief,
+        estimate,
         truth,
     };
     (drive, start)
@@ -210,7 +212,7 @@ fn localizes(naming: Naming) {
         map: Arc::new(TrackMap::new(track.grid.clone()).expect("free")),
         raceline: None,
     };
-    let (follower, poses) = match source.ros_side() {
+    let (pose_sink, poses) = match source.ros_connection() {
         None => (None, None),
         Some(side) => {
             let poses = ros_router
@@ -218,15 +220,19 @@ fn localizes(naming: Naming) {
                 .wait()
                 .expect("subscribes");
             (
-                Some(ros_pose::start(side.clone(), ros_pose::TOPIC).expect("starts").0),
+                Some(
+                    pose_publisher::start(side.clone(), pose_publisher::TOPIC)
+                        .expect("starts")
+                        .0,
+                ),
                 Some(poses),
             )
         }
     };
-    assert_eq!(follower.is_some(), naming == Naming::RmwZenoh);
+    assert_eq!(pose_sink.is_some(), naming == Naming::RmwZenoh);
     let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
     config.begin = Begin::Pose(start);
-    config.follower = follower;
+    config.pose_sink = pose_sink;
     config.connect = vec![wall_endpoint];
     let node = Node::start(config).expect("starts");
     let mut compared = 0;
@@ -234,22 +240,22 @@ fn localizes(naming: Naming) {
     while compared < 200 {
         assert!(Instant::now() < until, "{compared} beliefs compared");
         thread::sleep(Duration::from_millis(5));
-        let Some(belief) = *node.shared().belief.lock().expect("sound") else {
+        let Some(estimate) = node.shared().latest_pose() else {
             continue;
         };
-        *drive.belief.lock().expect("sound") = Some(belief);
+        *drive.estimate.lock().expect("sound") = Some(estimate);
         let truth = drive.truth.lock().expect("sound");
         let Some(pair) = truth
             .windows(2)
             .rev()
-            .find(|pair| pair[0].0 <= belief.stamp && belief.stamp < pair[1].0)
+            .find(|pair| pair[0].0 <= estimate.stamp && estimate.stamp < pair[1].0)
         else {
             continue;
         };
         let [(before, from), (after, to)] = [pair[0], pair[1]];
-        let true_pose = from.interpolate(to, belief.stamp.since(before) / after.since(before));
+        let true_pose = from.interpolate(to, estimate.stamp.since(before) / after.since(before));
         moved = moved.max(true_pose.distance(start));
-        let off = belief.pose.distance(true_pose);
+        let off = estimate.pose.distance(true_pose);
         assert!(off < 0.2, "{off} m off after {compared}");
         compared += 1;
         drop(truth);
@@ -268,7 +274,7 @@ fn localizes(naming: Naming) {
         // The controller gets what the filter believes, at odometry rate and with the stamps of the sensors.
         let poses: Vec<RosOdometry> = poses
             .drain()
-            .map(|sample| ros::decode(&sample.payload().to_bytes()).expect("a pose"))
+            .map(|sample| messages::decode(&sample.payload().to_bytes()).expect("a pose"))
             .collect();
         assert!(poses.len() > 50, "{}", poses.len());
         let last = poses.last().expect("many");

@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
+use car_node::control::parameter_sets;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::sets;
-use car_node::source::{Incident, Race, ScriptedIncident};
+use car_node::sensors::{Incident, Race, ScriptedIncident};
 use protocol::CarName;
 use simulator::{CarSetup, DriverParams, Grip, Guidance, OdometryParams, Track, YawSource};
 use synpf::TrackMap;
@@ -50,7 +50,7 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
         .map(|index| {
             let car = CarName::new(format!("car-{}", index + 1))?;
             let mut config = NodeConfig::new(car, map.clone(), Box::new(race.car(index)));
-            config.set = Some(sets::load(&options.params)?);
+            config.set = Some(parameter_sets::load(&options.params)?);
             config.begin = Begin::Source;
             config.seed = options.seed.wrapping_add(index as u64);
             let last = index + 1 == count;

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use car_node::archive::Archive;
+use car_node::telemetry::replay_buffer::ReplayBuffer;
 use pitwall::unix_now;
 use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
@@ -50,7 +50,7 @@ pub struct FakeCar {
 struct CarState {
     published: BTreeMap<Topic, u64>,
     /// The messages of the streams that must be whole.
-    archive: Archive,
+    archive: ReplayBuffer,
     set: SetRef,
     who: String,
     run_id: u64,
@@ -89,7 +89,7 @@ impl FakeCar {
         let session = zenoh::open(config(endpoint)).await.expect("a session");
         let state = Arc::new(Mutex::new(CarState {
             published: BTreeMap::new(),
-            archive: Archive::default(),
+            archive: ReplayBuffer::default(),
             set: SetRef {
                 name: "hq".into(),
                 revision: 1,

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::Race;
+use car_node::sensors::Race;
 use protocol::CarName;
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
 
-use car_node::ros::{
+use car_node::ros2::messages::{
     self, Header, LaserScan, Orientation, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
 };
 use maps::{Cell, OccupancyGrid, Pose};
@@ -92,7 +92,11 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
         },
     };
     let transforms = vec![mount];
-    write(tf, 0.0, ros::encode(&TfMessage { transforms }).expect("encoded"));
+    write(
+        tf,
+        0.0,
+        messages::encode(&TfMessage { transforms }).expect("encoded"),
+    );
     let first = true_pose(0.0);
     // Both in one loop of 5 ms, so that the bag is in order of time.
     for tick in 0..(seconds * 200.0) as u32 {
@@ -107,10 +111,10 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
             };
             message.linear.x = SPEED;
             message.angular.z = SPEED / RADIUS;
-            write(odometry, now, ros::encode(&message).expect("encoded"));
+            write(odometry, now, messages::encode(&message).expect("encoded"));
             message.header.frame_id = "map".into();
             message.pose = pose.into();
-            write(truth, now, ros::encode(&message).expect("encoded"));
+            write(truth, now, messages::encode(&message).expect("encoded"));
         }
         if tick % 5 == 0 {
             let laser = pose * BASE_LINK_FROM_LASER;
@@ -127,7 +131,7 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
                 ranges: (0..BEAMS).map(|beam| range(room, laser, angle(beam))).collect(),
                 ..LaserScan::default()
             };
-            write(scans, now, ros::encode(&message).expect("encoded"));
+            write(scans, now, messages::encode(&message).expect("encoded"));
         }
     }
     bag.finish().expect("a whole file");

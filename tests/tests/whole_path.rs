@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use car_node::bag::{Bag, Topics};
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::source::BagPlayer;
+use car_node::sensors::BagPlayer;
+use car_node::sensors::bag::{Bag, Topics};
 use pitwall::{Happening, Verdict, read_events};
 use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
 use synpf::TrackMap;

@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context;
-use car_node::bag::SensorLog;
 use car_node::evaluate::ablation::{Change, Step, steps};
-use car_node::evaluate::{Outcome, Start, Summaries, Truth, mean, run as run_over};
-use car_node::frames::Mount;
+use car_node::evaluate::{Outcome, Start, Summaries, Truth, run as run_over};
+use car_node::sensors::bag::SensorLog;
+use car_node::sensors::frames::Mount;
+use car_node::statistics::mean;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use synpf::{SetUpError, SynPf, TrackMap};

@@ -7,8 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use car_node::bag::SensorLog;
-use car_node::evaluate::{ErrorSummary, Fault, FaultReport, Outcome, Start, Truth, run as run_over};
+use car_node::evaluate::{Fault, FaultReport, Outcome, Start, Truth, run as run_over};
+use car_node::sensors::bag::SensorLog;
+use car_node::statistics::ErrorSummary;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use synpf::{SynPf, Update};
@@ -21,7 +22,7 @@ use crate::cli::Evaluate;
 struct RangeTable {
     /// Time to build it [ms].
     build_ms: f64,
-    /// Memory that it takes.
+    /// PersistedState that it takes.
     bytes: usize,
 }
 

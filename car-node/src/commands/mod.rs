@@ -10,6 +10,7 @@ macro_rules! say {
 }
 
 pub(crate) mod ablate;
+mod drawing;
 pub(crate) mod evaluate;
 pub(crate) mod race;
 pub(crate) mod run;
@@ -20,10 +21,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, bail};
-use car_node::bag::{Bag, SensorLog, Topics};
+use car_node::control::parameter_sets::{self, NamedSet, SetError};
 use car_node::evaluate::read_poses;
-use car_node::frames::Mount;
-use car_node::sets::{self, NamedSet, SetError};
+use car_node::sensors::bag::{Bag, SensorLog, Topics};
+use car_node::sensors::frames::Mount;
 use maps::{MapError, OccupancyGrid};
 use simulator::{BUNDLED, Track};
 use synpf::TrackMap;
@@ -114,7 +115,7 @@ fn warn_of_guess(source: &str) {
 
 /// A parameter set, with a warning that lists the keys that mean nothing.
 fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
-    let set = sets::load(name_or_path).map_err(|error| match error {
+    let set = parameter_sets::load(name_or_path).map_err(|error| match error {
         SetError::Unknown(_) => BadUsage(error.to_string()).into(),
         _ => anyhow::Error::from(error),
     })?;

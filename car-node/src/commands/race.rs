@@ -5,9 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use car_node::race::{
-    CarResult, Guide, MeanSigma, PAPER_ROWS, Quality, RaceSetup, RaceSummary, SPEED_SCALE, race,
-};
+use car_node::race::{CarResult, PAPER_ROWS, PoseSource, Quality, RaceSetup, RaceSummary, SPEED_SCALE, race};
+use car_node::statistics::MeanSigma;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -45,12 +44,12 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
         // Its rows are there to be compared, and some are there to crash.
         return table(arguments, &track, &map).map(|()| ExitCode::SUCCESS);
     }
-    let (localizer, guide) = chosen(arguments)?;
+    let (localizer, pose_source) = chosen(arguments)?;
     let quality = match arguments.odometry {
         cli::Odometry::Hq => Quality::Hq,
         cli::Odometry::Lq => Quality::Lq,
     };
-    let report = races(arguments, &track, &map, localizer, guide, quality)?;
+    let report = races(arguments, &track, &map, localizer, pose_source, quality)?;
     if arguments.json {
         say!("{}", serde_json::to_string_pretty(&report)?);
     } else {
@@ -66,29 +65,29 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
 }
 
 /// What the arguments ask for, and what to call it.
-fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, Guide)> {
+fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, PoseSource)> {
     Ok(match arguments.localizer {
-        cli::Guide::Synpf => {
+        cli::PoseSource::Synpf => {
             let set = load_set(&arguments.params)?;
             (
                 format!("synpf {}", set.name),
-                Guide::SynPf(Box::new(set.parameters)),
+                PoseSource::SynPf(Box::new(set.parameters)),
             )
         }
-        cli::Guide::SynpfBaseline => shipped("synpf-baseline")?,
-        cli::Guide::Odometry => ("odometry".into(), Guide::Odometry),
-        cli::Guide::Truth => ("truth".into(), Guide::Truth),
+        cli::PoseSource::SynpfBaseline => shipped("synpf-baseline")?,
+        cli::PoseSource::Odometry => ("odometry".into(), PoseSource::Odometry),
+        cli::PoseSource::Truth => ("truth".into(), PoseSource::Truth),
     })
 }
 
-fn shipped(name: &str) -> anyhow::Result<(String, Guide)> {
+fn shipped(name: &str) -> anyhow::Result<(String, PoseSource)> {
     let parameters = Parameters::named(name).with_context(|| format!("no parameter set {name}"))?;
     let title = if name.starts_with("synpf") {
         name.into()
     } else {
         format!("synpf {name}")
     };
-    Ok((title, Guide::SynPf(Box::new(parameters))))
+    Ok((title, PoseSource::SynPf(Box::new(parameters))))
 }
 
 /// One race for each seed, side by side on the machine's cores.
@@ -97,7 +96,7 @@ fn races(
     track: &Arc<Track>,
     map: &Arc<TrackMap>,
     localizer: String,
-    guide: Guide,
+    pose_source: PoseSource,
     quality: Quality,
 ) -> anyhow::Result<Report> {
     let seeds: Vec<u64> = (0..arguments.seeds)
@@ -107,7 +106,7 @@ fn races(
         laps: arguments.laps,
         cars: arguments.cars.into(),
         quality,
-        guide,
+        pose_source,
         speed_scale: arguments.speed,
         seed: 0,
     };
@@ -160,16 +159,16 @@ fn name(quality: Quality) -> &'static str {
 /// The paper's grid.
 fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyhow::Result<()> {
     let mut rows = vec![(shipped("hq")?, Quality::Hq), (shipped("lq")?, Quality::Lq)];
-    for guide in [
+    for pose_source in [
         shipped("synpf-baseline")?,
-        ("odometry".into(), Guide::Odometry),
-        ("truth".into(), Guide::Truth),
+        ("odometry".into(), PoseSource::Odometry),
+        ("truth".into(), PoseSource::Truth),
     ] {
-        rows.extend([Quality::Hq, Quality::Lq].map(|quality| (guide.clone(), quality)));
+        rows.extend([Quality::Hq, Quality::Lq].map(|quality| (pose_source.clone(), quality)));
     }
     let mut reports = Vec::new();
-    for ((localizer, guide), quality) in rows {
-        let mut report = races(arguments, track, map, localizer, guide, quality)?;
+    for ((localizer, pose_source), quality) in rows {
+        let mut report = races(arguments, track, map, localizer, pose_source, quality)?;
         report.races.clear();
         reports.push(report);
     }

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
-use car_node::frames::Mount;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
-use car_node::ros_pose;
-use car_node::source::{BagPlayer, Belief, Race, Ros2, Ros2Options, Source};
+use car_node::ros2::pose_publisher;
+use car_node::sensors::frames::Mount;
+use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
 use simulator::{CarSetup, Grip, OdometryParams, YawSource};
@@ -22,7 +22,7 @@ const LINGER: Duration = Duration::from_secs(1);
 
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let signal = signals()?;
-    let mut follower = None;
+    let mut pose_sink = None;
     let (map, source, begin): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
         (SourceKind::Bag, Some(bag)) => {
             let mut log = super::read_bag(bag, &arguments.topics)?;
@@ -40,7 +40,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             // The map first: its faults show without ROS.
             let map = map_file(arguments)?;
             let source = ros2(arguments, &signal)?;
-            follower = pose_for_ros(arguments, &source)?;
+            pose_sink = pose_for_ros(arguments, &source)?;
             (map, Box::new(source), Begin::Global)
         }
         (SourceKind::Simulator, _) => {
@@ -63,7 +63,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     config.connect.clone_from(&arguments.connect);
     config.rates.recorded = !arguments.no_recorded;
     config.predict = arguments.predict;
-    config.follower = follower;
+    config.pose_sink = pose_sink;
     config.state = arguments
         .state
         .clone()
@@ -76,19 +76,15 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     };
     eprintln!("{}: {description}; dials {wall}. Ctrl-C ends it.", arguments.car);
     let reason = wait(&node, &signal, arguments.stay);
-    let belief = *node
-        .shared()
-        .belief
-        .lock()
-        .unwrap_or_else(std::sync::PoisonError::into_inner);
+    let estimate = node.shared().latest_pose();
     node.shutdown(reason);
-    match belief {
-        Some(belief) => eprintln!(
+    match estimate {
+        Some(estimate) => eprintln!(
             "{}: {reason}; last at {:.2}, {:.2} m, {:.1} deg.",
             arguments.car,
-            belief.pose.x,
-            belief.pose.y,
-            belief.pose.heading.to_degrees()
+            estimate.pose.x,
+            estimate.pose.y,
+            estimate.pose.heading.to_degrees()
         ),
         None => eprintln!("{}: {reason}; never had a pose.", arguments.car),
     }
@@ -128,17 +124,17 @@ fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2
 }
 
 /// Where the pose goes for the car's own nodes, unless they are behind a bridge.
-fn pose_for_ros(arguments: &Run, source: &Ros2) -> anyhow::Result<Option<Sender<Belief>>> {
-    let Some(side) = source.ros_side() else {
+fn pose_for_ros(arguments: &Run, source: &Ros2) -> anyhow::Result<Option<Sender<PoseEstimate>>> {
+    let Some(ros) = source.ros_connection() else {
         eprintln!(
             "car-node: warning: behind a bridge the pose is not published to ROS ({}): it takes rmw_zenoh",
             arguments.pose_topic
         );
         return Ok(None);
     };
-    let (follower, _) = ros_pose::start(side.clone(), &arguments.pose_topic)
+    let (pose_sink, _) = pose_publisher::start(ros.clone(), &arguments.pose_topic)
         .map_err(|error| anyhow!("{}: cannot be published: {error}", arguments.pose_topic))?;
-    Ok(Some(follower))
+    Ok(Some(pose_sink))
 }
 
 /// Waits for whatever ends the node first, and says what that was.

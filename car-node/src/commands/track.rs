@@ -7,9 +7,9 @@ use anyhow::{Context, bail};
 use maps::Cell;
 use simulator::{Track, TrackReport, TrackSpec};
 
+use super::drawing;
 use super::find_track;
 use crate::cli::TrackCommand;
-use crate::drawing;
 
 pub(crate) fn run(command: &TrackCommand) -> anyhow::Result<()> {
     match command {

@@ -4,7 +4,7 @@ use maps::{Pose, wrap_angle};
 use serde::Serialize;
 use synpf::Stamp;
 
-use super::statistics::ErrorSummary;
+use crate::statistics::ErrorSummary;
 
 /// Errors this soon after the first estimate are those of the start, and left out [s].
 pub(super) const SETTLING: f64 = 2.0;

@@ -8,7 +8,7 @@ use maps::Pose;
 use serde::Serialize;
 use synpf::{Scan, Stamp};
 
-use crate::bag::{Arrival, SensorEvent, SensorLog};
+use crate::sensors::bag::{Arrival, SensorEvent, SensorLog};
 
 /// What goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -201,7 +201,7 @@ fn on_beams(log: &mut SensorLog, within: impl Fn(Stamp) -> bool, change: impl Fn
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bag::Topics;
+    use crate::sensors::bag::Topics;
     use synpf::{Odometry, Twist};
 
     /// Ten seconds at 1 m/s along x: a scan of four beams and odometry, ten times a second, and the truth.

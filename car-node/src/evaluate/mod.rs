@@ -6,7 +6,6 @@ mod errors;
 mod faults;
 mod pose_file;
 mod states;
-mod statistics;
 mod truth;
 
 use std::collections::BTreeMap;
@@ -20,11 +19,11 @@ pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
 pub use pose_file::{PoseFileError, read_poses};
 pub use states::{FaultReport, StateChange, StateTruth, States};
-pub use statistics::{ErrorSummary, mean, percentile};
 pub use truth::Truth;
 
-use crate::bag::{Arrival, SensorEvent};
 use crate::health::{Monitor, State, Thresholds};
+use crate::sensors::bag::{Arrival, SensorEvent};
+use crate::statistics::{mean, percentile};
 
 /// Where a run starts from.
 #[derive(Debug, Clone, Copy, PartialEq)]

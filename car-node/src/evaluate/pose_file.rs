@@ -7,7 +7,7 @@ use csv::{ReaderBuilder, StringRecord, Trim};
 use maps::Pose;
 use synpf::Stamp;
 
-use crate::bag::StampedPoses;
+use crate::sensors::bag::StampedPoses;
 
 /// Columns of poses of `base_link`.
 const BASE_LINK: [&str; 4] = ["stamp_s", "x_m", "y_m", "heading_rad"];

@@ -4,10 +4,10 @@ use std::collections::{HashMap, VecDeque};
 
 use synpf::{Mode, Stamp, Update};
 
-use super::fit::Fit;
 use super::rules::{Evidence, Family, Finding, findings};
+use super::scan_fit::ScanFit;
 use super::{Cause, CauseKind, Metrics, Severity, State, Thresholds};
-use crate::evaluate::percentile;
+use crate::statistics::percentile;
 use crate::wire::finite;
 
 /// The state, with all that led to it.
@@ -43,7 +43,7 @@ pub struct Monitor {
     /// For how many scans on end each kind was found.
     streaks: HashMap<CauseKind, u32>,
     /// The fit, smoothed over the longer and the shorter time.
-    fit: Option<[Fit; 2]>,
+    fit: Option<[ScanFit; 2]>,
     /// Since when each family has said that the pose is wrong.
     lost_since: [Option<Stamp>; Family::COUNT],
     /// Since when the scan has been off the walls beyond doubt.
@@ -143,7 +143,7 @@ impl Monitor {
         self.stale_or_not(!missing.is_empty(), now);
         let mut metrics = Metrics::of(update);
         self.add_ages(&mut metrics, update.stamp, now);
-        let [slow, fast] = self.smooth(Fit::of(&metrics), update.stamp);
+        let [slow, fast] = self.smooth(ScanFit::of(&metrics), update.stamp);
         let evidence = Evidence {
             metrics: &metrics,
             slow,
@@ -206,12 +206,12 @@ impl Monitor {
     }
 
     /// The fit with this scan in it, over the longer and the shorter time.
-    fn smooth(&mut self, fit: Fit, stamp: Stamp) -> [Fit; 2] {
+    fn smooth(&mut self, fit: ScanFit, stamp: Stamp) -> [ScanFit; 2] {
         let t = &self.thresholds;
         let smoothed = match (self.fit, self.last_update) {
             (Some(before), Some(last)) => {
                 let seconds = stamp.since(last).max(0.0);
-                let step = |before: Fit, time: f64| before.towards(fit, 1.0 - (-seconds / time).exp());
+                let step = |before: ScanFit, time: f64| before.towards(fit, 1.0 - (-seconds / time).exp());
                 [step(before[0], t.smoothing), step(before[1], t.smoothing_lost)]
             }
             // A new pose has nothing to do with how the one before it fitted.
@@ -235,7 +235,7 @@ impl Monitor {
     }
 
     /// Counts scans on end, and since when families have spoken and when nothing has been wrong.
-    fn count(&mut self, fit: Fit, stamp: Stamp) {
+    fn count(&mut self, fit: ScanFit, stamp: Stamp) {
         let findings = &self.findings;
         self.streaks
             .retain(|kind, _| findings.iter().any(|finding| finding.kind == *kind));

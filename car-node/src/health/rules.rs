@@ -1,6 +1,6 @@
 //! The table of metrics against their thresholds: which are bad, and what they speak for.
 
-use super::fit::Fit;
+use super::scan_fit::ScanFit;
 use super::{CauseKind, Metrics, Severity, Thresholds};
 
 /// Families of evidence. Two metrics of one family rise and fall together, so that they count once.
@@ -90,9 +90,9 @@ pub(super) struct Evidence<'a> {
     /// This update alone, but for the ages.
     pub(super) metrics: &'a Metrics,
     /// The fit over the last quarter of a second: single scans do not degrade the state.
-    pub(super) slow: Fit,
+    pub(super) slow: ScanFit,
     /// The fit over the last tenth of a second: a wrong pose shows soon.
-    pub(super) fast: Fit,
+    pub(super) fast: ScanFit,
     /// The state is good now, so that a limit is only crossed where it says; else all must be better than that.
     pub(super) good: bool,
 }

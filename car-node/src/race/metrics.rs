@@ -10,8 +10,9 @@ use simulator::Track;
 use synpf::{Scan, Stamp, TrackMap};
 
 use super::paper_alignment;
-use crate::evaluate::{PoseErrors, StateTruth, States, Summaries, mean, percentile};
+use crate::evaluate::{PoseErrors, StateTruth, States, Summaries};
 use crate::health::State;
+use crate::statistics::{MeanSigma, mean, percentile};
 
 /// One finished lap.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -103,28 +104,6 @@ pub struct CarResult {
     pub race_s: f64,
     /// Measured on this machine: differs from run to run.
     pub load: LoadSummary,
-}
-
-/// Mean and standard deviation.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct MeanSigma {
-    /// Mean.
-    pub mean: f64,
-    /// Standard deviation of the sample.
-    pub sigma: f64,
-}
-
-impl MeanSigma {
-    /// Of some values; None without any.
-    pub fn of(values: &[f64]) -> Option<Self> {
-        let mean = mean(values)?;
-        let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
-        let freedom = (values.len() - 1).max(1) as f64;
-        Some(Self {
-            mean,
-            sigma: (squares / freedom).sqrt(),
-        })
-    }
 }
 
 /// All cars of all seeds together.
@@ -373,19 +352,5 @@ impl Recorder {
                 real_time_factor: race.as_secs_f64() / elapsed.as_secs_f64().max(1e-9),
             },
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sigma_is_that_of_a_sample() {
-        let of = MeanSigma::of(&[1.0, 2.0, 3.0]).expect("three values");
-        assert!((of.mean - 2.0).abs() < 1e-12 && (of.sigma - 1.0).abs() < 1e-12);
-        let one = MeanSigma::of(&[4.0]).expect("one value");
-        assert!(one.sigma.abs() < 1e-12);
-        assert!(MeanSigma::of(&[]).is_none());
     }
 }

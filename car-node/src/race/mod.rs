@@ -18,16 +18,16 @@ use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Tr
 use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, SynPf, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
-pub use metrics::{CarResult, LapRecord, LoadSummary, MeanSigma, Mishap, MishapKind, RaceSummary};
+pub use metrics::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary};
 pub use paper::{PAPER_ROWS, PaperRow};
 
 use crate::health::{Monitor, Thresholds};
-use crate::source::{Script, ScriptedIncident};
+use crate::sensors::{Script, ScriptedIncident};
 use metrics::Recorder;
 
 /// What tells the driver where the car is.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Guide {
+pub enum PoseSource {
     /// The filter with a parameter set.
     SynPf(Box<Parameters>),
     /// Wheel odometry alone, from a perfect start.
@@ -71,7 +71,7 @@ pub struct RaceSetup {
     /// Grip.
     pub quality: Quality,
     /// What every car goes by.
-    pub guide: Guide,
+    pub pose_source: PoseSource,
     /// Speed over the raceline's own, beside [`SPEED_SCALE`].
     pub speed_scale: f64,
     /// Decides every random number.
@@ -98,7 +98,7 @@ pub fn race(
         map,
         &field(setup),
         Vec::new(),
-        &setup.guide,
+        &setup.pose_source,
         end,
         setup.seed,
     )
@@ -126,47 +126,50 @@ fn field(setup: &RaceSetup) -> Vec<CarSetup> {
         .collect()
 }
 
-/// Runs a race of any cars, to which things may happen. Cars that go by the truth have no localizer, whatever `guide` says.
+/// Runs a race of any cars, to which things may happen. Cars that go by the truth have no localizer, whatever `pose_source` says.
 pub fn run(
     track: &Arc<Track>,
     map: &Arc<TrackMap>,
     setups: &[CarSetup],
     script: Vec<ScriptedIncident>,
-    guide: &Guide,
+    pose_source: &PoseSource,
     end: End,
     seed: u64,
 ) -> Result<Vec<CarResult>, SetUpError> {
     let mut world = World::new(Arc::clone(track), setups, seed);
     let mut script = Script::new(script);
-    let mut crews = (0..)
+    let mut runners = (0..)
         .zip(setups)
-        .map(|(index, car)| Crew::new(&world, index, map, guide, car, seed))
+        .map(|(index, car)| CarRunner::new(&world, index, map, pose_source, car, seed))
         .collect::<Result<Vec<_>, _>>()?;
 
     let begin = Instant::now();
-    let done = |crews: &[Crew]| {
-        end.laps
-            .is_some_and(|laps| crews.iter().all(|crew| crew.recorder.laps() >= laps as usize))
+    let done = |runners: &[CarRunner]| {
+        end.laps.is_some_and(|laps| {
+            runners
+                .iter()
+                .all(|runner| runner.recorder.laps() >= laps as usize)
+        })
     };
-    while !done(&crews) && world.now() < end.time {
+    while !done(&runners) && world.now() < end.time {
         script.play(&mut world);
         for output in world.step() {
             let index = output.car;
-            if let Some(estimate) = crews[index].take_in(&world, index, &output.message) {
+            if let Some(estimate) = runners[index].handle(&world, index, &output.message) {
                 world.guide(index, estimate);
             }
         }
     }
     let elapsed = begin.elapsed();
-    Ok(crews
+    Ok(runners
         .into_iter()
-        .map(|crew| crew.recorder.result(world.now(), elapsed, end.laps))
+        .map(|runner| runner.recorder.result(world.now(), elapsed, end.laps))
         .collect())
 }
 
 /// One car's localizer and everything that is noted of it.
-struct Crew {
-    guide: RunningGuide,
+struct CarRunner {
+    pose_source: ActivePoseSource,
     recorder: Recorder,
     /// True poses of the last half second, for estimates that are about the past.
     truths: VecDeque<(Stamp, Pose)>,
@@ -174,27 +177,27 @@ struct Crew {
     latest: Option<simulator::Odometry>,
 }
 
-enum RunningGuide {
+enum ActivePoseSource {
     SynPf(Box<SynPf>, Box<Monitor>),
     /// `map_from_odom`, once it is known.
     Odometry(Option<Pose>, Pose),
     Truth,
 }
 
-impl Crew {
+impl CarRunner {
     fn new(
         world: &World,
         index: usize,
         map: &Arc<TrackMap>,
-        guide: &Guide,
+        pose_source: &PoseSource,
         car: &CarSetup,
         seed: u64,
     ) -> Result<Self, SetUpError> {
         let start = world.truth(index).pose;
         let base_link_from_laser = car.lidar.base_link_from_laser;
-        let guide = match guide {
-            _ if car.guidance == Guidance::Truth => RunningGuide::Truth,
-            Guide::SynPf(parameters) => {
+        let pose_source = match pose_source {
+            _ if car.guidance == Guidance::Truth => ActivePoseSource::Truth,
+            PoseSource::SynPf(parameters) => {
                 let seed = seed.wrapping_add(index as u64);
                 let parameters = Parameters::clone(parameters);
                 // A car's tables are ready before it starts.
@@ -203,13 +206,13 @@ impl Crew {
                 localizer.initialize(start)?;
                 let mut monitor = Monitor::new(Thresholds::default(), stamp(world.now()));
                 monitor.on_new_pose(stamp(world.now()));
-                RunningGuide::SynPf(Box::new(localizer), Box::new(monitor))
+                ActivePoseSource::SynPf(Box::new(localizer), Box::new(monitor))
             }
-            Guide::Odometry => RunningGuide::Odometry(None, start),
-            Guide::Truth => RunningGuide::Truth,
+            PoseSource::Odometry => ActivePoseSource::Odometry(None, start),
+            PoseSource::Truth => ActivePoseSource::Truth,
         };
         Ok(Self {
-            guide,
+            pose_source,
             recorder: Recorder::new(Arc::clone(world.track()), Arc::clone(map)),
             truths: VecDeque::new(),
             base_link_from_laser,
@@ -218,7 +221,7 @@ impl Crew {
     }
 
     /// Passes a message on to the localizer. Returns an estimate when there is a new one.
-    fn take_in(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
+    fn handle(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
         match message {
             Message::Odometry(odometry) => {
                 self.latest = Some(*odometry);
@@ -233,7 +236,7 @@ impl Crew {
                 })
             }
             Message::Gyro(gyro) => {
-                if let RunningGuide::SynPf(localizer, _) = &mut self.guide {
+                if let ActivePoseSource::SynPf(localizer, _) = &mut self.pose_source {
                     let reading = YawRate {
                         stamp: stamp(gyro.stamp),
                         rate: gyro.yaw_rate,
@@ -261,13 +264,15 @@ impl Crew {
             }
             Message::Placed(pose) => {
                 // The localizer gets the pose at which the recovery crew put the car.
-                match &mut self.guide {
-                    RunningGuide::SynPf(localizer, monitor) => {
+                match &mut self.pose_source {
+                    ActivePoseSource::SynPf(localizer, monitor) => {
                         localizer.initialize(*pose).ok();
                         monitor.on_new_pose(stamp(world.now()));
                     }
-                    RunningGuide::Odometry(map_from_odom, start) => (*map_from_odom, *start) = (None, *pose),
-                    RunningGuide::Truth => {}
+                    ActivePoseSource::Odometry(map_from_odom, start) => {
+                        (*map_from_odom, *start) = (None, *pose)
+                    }
+                    ActivePoseSource::Truth => {}
                 }
                 None
             }
@@ -303,8 +308,8 @@ impl Crew {
 
     /// `map_from_base_link` at the odometry's stamp.
     fn on_odometry(&mut self, odometry: &simulator::Odometry, world: &World, index: usize) -> Option<Pose> {
-        match &mut self.guide {
-            RunningGuide::SynPf(localizer, monitor) => {
+        match &mut self.pose_source {
+            ActivePoseSource::SynPf(localizer, monitor) => {
                 monitor.on_odometry(stamp(world.now()));
                 let message = Odometry {
                     stamp: stamp(odometry.stamp),
@@ -320,11 +325,11 @@ impl Crew {
                     localizer.predict(message.stamp)
                 })
             }
-            RunningGuide::Odometry(map_from_odom, start) => {
+            ActivePoseSource::Odometry(map_from_odom, start) => {
                 let map_from_odom = map_from_odom.get_or_insert(*start * odometry.pose.inverse());
                 Some(*map_from_odom * odometry.pose)
             }
-            RunningGuide::Truth => Some(world.truth(index).pose),
+            ActivePoseSource::Truth => Some(world.truth(index).pose),
         }
     }
 
@@ -340,10 +345,10 @@ impl Crew {
             ranges: scan.ranges.clone(),
         };
         let truth = self.truth_at(message.stamp);
-        let RunningGuide::SynPf(localizer, monitor) = &mut self.guide else {
+        let ActivePoseSource::SynPf(localizer, monitor) = &mut self.pose_source else {
             // What has no opinion of scans is judged by where it says the car is, or the truth.
-            let pose = match &self.guide {
-                RunningGuide::Odometry(map_from_odom, _) => {
+            let pose = match &self.pose_source {
+                ActivePoseSource::Odometry(map_from_odom, _) => {
                     let latest = self.latest?;
                     let back = latest.stamp.as_secs_f64() - scan.stamp.as_secs_f64();
                     let moved = [latest.speed, 0.0, latest.yaw_rate].map(|rate| -rate * back);
@@ -402,7 +407,7 @@ pub const RACE_TICK: Duration = TICK;
 mod tests {
     use super::*;
     use crate::health::State;
-    use crate::source::Incident;
+    use crate::sensors::Incident;
     use simulator::YawSource;
 
     fn club() -> (Arc<Track>, Arc<TrackMap>) {
@@ -412,12 +417,12 @@ mod tests {
         (Arc::new(track), Arc::new(map))
     }
 
-    fn setup(guide: Guide, laps: u32, cars: usize) -> RaceSetup {
+    fn setup(pose_source: PoseSource, laps: u32, cars: usize) -> RaceSetup {
         RaceSetup {
             laps,
             cars,
             quality: Quality::Hq,
-            guide,
+            pose_source,
             speed_scale: 1.0,
             seed: 5,
         }
@@ -426,7 +431,7 @@ mod tests {
     #[test]
     fn on_the_truth_a_lap_of_club_takes_what_the_paper_s_took() {
         let (track, map) = club();
-        let results = race(&track, &map, &setup(Guide::Truth, 2, 1)).expect("a race");
+        let results = race(&track, &map, &setup(PoseSource::Truth, 2, 1)).expect("a race");
         let [car] = &results[..] else { panic!("one car") };
         assert!(car.finished && car.crashes == 0);
         for lap in &car.laps {
@@ -441,7 +446,7 @@ mod tests {
     fn a_race_tells_its_states_and_what_went_wrong_with_its_cause() {
         let (track, map) = club();
         let parameters = Box::new(Parameters::named("hq").expect("ships"));
-        let setup = setup(Guide::SynPf(parameters), 1, 1);
+        let setup = setup(PoseSource::SynPf(parameters), 1, 1);
         let knock = ScriptedIncident {
             at: Duration::from_secs(6),
             car: 0,
@@ -451,7 +456,16 @@ mod tests {
             laps: None,
             time: Duration::from_secs(9),
         };
-        let results = run(&track, &map, &field(&setup), vec![knock], &setup.guide, end, 1).expect("a race");
+        let results = run(
+            &track,
+            &map,
+            &field(&setup),
+            vec![knock],
+            &setup.pose_source,
+            end,
+            1,
+        )
+        .expect("a race");
         let [car] = &results[..] else { panic!("one car") };
         let spin = car.mishaps.iter().find(|mishap| mishap.kind == MishapKind::Spin);
         let spin = spin.expect("15 rad/s turn any car round");
@@ -479,7 +493,7 @@ mod tests {
         let setup = RaceSetup {
             quality: Quality::Lq,
             ..setup(
-                Guide::SynPf(Box::new(Parameters::named("hq").expect("ships"))),
+                PoseSource::SynPf(Box::new(Parameters::named("hq").expect("ships"))),
                 3,
                 1,
             )
@@ -490,7 +504,7 @@ mod tests {
             laps: Some(3),
             time: Duration::from_secs(40),
         };
-        let results = run(&track, &map, &cars, Vec::new(), &setup.guide, end, 1).expect("a race");
+        let results = run(&track, &map, &cars, Vec::new(), &setup.pose_source, end, 1).expect("a race");
         assert!(
             results[0].finished && results[0].mishaps.is_empty(),
             "{:?}",
@@ -503,7 +517,7 @@ mod tests {
         let (track, map) = club();
         let setup = RaceSetup {
             quality: Quality::Lq,
-            ..setup(Guide::Odometry, 10, 1)
+            ..setup(PoseSource::Odometry, 10, 1)
         };
         let results = race(&track, &map, &setup).expect("a race");
         assert!(results[0].crashes > 0);
@@ -516,7 +530,7 @@ mod tests {
         let run = |seed| {
             let setup = RaceSetup {
                 seed,
-                ..setup(Guide::SynPf(Box::new(parameters.clone())), 1, 2)
+                ..setup(PoseSource::SynPf(Box::new(parameters.clone())), 1, 2)
             };
             let results = race(&track, &map, &setup).expect("a race");
             let without_load: Vec<_> = results

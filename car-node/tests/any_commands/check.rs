@@ -8,15 +8,19 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use arbitrary::{Arbitrary, Unstructured};
-use car_node::bag::SensorEvent;
-use car_node::clock::SensorClock;
-use car_node::desk::{Answered, Clerk, Desk, Print};
-use car_node::filter::{self, Filter, Order, Shared};
+use car_node::control::parameter_store::ParameterStore;
+use car_node::control::persisted_state::PersistedState;
+use car_node::control::{CachedAnswer, CommandHandler, CommandHandlerConfig, PayloadHash};
 use car_node::health::{Monitor, Thresholds};
-use car_node::keeper::{Keeper, Memory};
-use car_node::outbox::Record;
-use car_node::shadow;
-use car_node::source::Feed;
+use car_node::localization::filter_command::FilterCommand;
+use car_node::localization::filter_worker::{self, FilterConfig};
+use car_node::localization::shadow;
+use car_node::localization::shadow_channel::shadow_channel;
+use car_node::sensors::Feed;
+use car_node::sensors::bag::SensorEvent;
+use car_node::sensors::clock::SensorClock;
+use car_node::telemetry::queue::Record;
+use car_node::telemetry::shared_state::SharedState;
 use crossbeam_channel::{Receiver, Sender, bounded};
 use maps::{Cell, OccupancyGrid, Pose};
 use protocol::{
@@ -131,20 +135,20 @@ enum Any {
 
 /// A car that takes commands, but for the network.
 struct Car {
-    clerk: Clerk,
-    shared: Arc<Shared>,
+    handler: CommandHandler,
+    shared: Arc<SharedState>,
     feed: Sender<Feed>,
     filter: JoinHandle<()>,
     shadow: JoinHandle<()>,
     revisions: u64,
     /// Answers that it has given, and must give again.
-    given: BTreeMap<CommandId, Answered>,
+    given: BTreeMap<CommandId, CachedAnswer>,
 }
 
 /// What must be as before after a command that was refused.
 #[derive(Debug, PartialEq)]
 struct State {
-    memory: Memory,
+    memory: PersistedState,
     params: Params,
     rates: Rates,
     auto: bool,
@@ -197,7 +201,7 @@ pub(crate) struct Tally {
 /// Lets all that these bytes stand for happen to a new car, and checks that nothing comes of it that may not.
 pub(crate) fn check(bytes: &[u8], tally: &mut Tally) {
     let mut dice = Unstructured::new(bytes);
-    let mut car = Car::start(Memory::default());
+    let mut car = Car::start(PersistedState::default());
     let mut sensors = Stamp(1_000_000_000);
     let mut steps = 0;
     while !dice.is_empty() && steps < MOST_STEPS {
@@ -244,7 +248,7 @@ pub(crate) fn check(bytes: &[u8], tally: &mut Tally) {
                     car.drive(sensors);
                 }
             }
-            Step::Clock => car.clerk.look_at_the_clock(),
+            Step::Clock => car.handler.tick(),
             Step::Restart => {
                 let memory = car.stop();
                 car = Car::start(memory);
@@ -256,14 +260,14 @@ pub(crate) fn check(bytes: &[u8], tally: &mut Tally) {
 }
 
 impl Car {
-    fn start(memory: Memory) -> Self {
+    fn start(memory: PersistedState) -> Self {
         let revisions = memory.revision;
         let given = memory
             .answers
             .iter()
             .map(|given| (given.answer.id, given.clone()));
         let given = given.collect();
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(SharedState::default());
         let clock = SensorClock::starting_at(Stamp(1_000_000_000), 1.0);
         let name = memory.settled.clone().unwrap_or_else(|| "hq".into());
         let parameters = match memory.sets.get(&name) {
@@ -275,30 +279,32 @@ impl Car {
         localizer
             .initialize(map().grid().origin * Pose::new(1.0, 1.0, 0.0))
             .expect("on the map");
-        let keeper = Keeper::new(memory, name, parameters, Stamp(0));
-        let (orders, ordered): (Sender<Order>, Receiver<Order>) = bounded(8);
-        let (feed, fed) = bounded(64);
-        let (wishes, wished) = bounded(8);
-        let (tap, tapped) = shadow::tap();
-        let filter = Filter {
+        let store = ParameterStore::new(memory, name, parameters, Stamp(0));
+        let (to_filter, filter_commands): (Sender<FilterCommand>, Receiver<FilterCommand>) = bounded(8);
+        let (feed, filter_feed) = bounded(64);
+        let (to_shadow, shadow_commands) = bounded(8);
+        let (shadow_sender, shadow_receiver) = shadow_channel();
+        let filter = FilterConfig {
             localizer,
+            map: Arc::clone(map()),
             monitor: Monitor::new(Thresholds::default(), clock.now()),
             base_link_from_laser: mount,
             raceline: None,
             clock,
-            set: keeper.reference(),
+            set: store.reference(),
             predict: true,
             shared: Arc::clone(&shared),
-            tap,
-            follower: None,
+            shadow: shadow_sender,
+            pose_sink: None,
         };
-        let filter = filter::start(filter, fed, ordered).expect("a thread");
-        let shadow = shadow::start(tapped, wished, Arc::clone(&shared), clock).expect("a thread");
-        let clerk = Clerk::new(Desk {
-            keeper,
+        let filter = filter_worker::start(filter, filter_feed, filter_commands).expect("a thread");
+        let shadow =
+            shadow::start(shadow_receiver, shadow_commands, Arc::clone(&shared), clock).expect("a thread");
+        let handler = CommandHandler::new(CommandHandlerConfig {
+            store,
             file: None,
-            orders,
-            shadow: wishes,
+            filter_commands: to_filter,
+            shadow_commands: to_shadow,
             base_link_from_laser: mount,
             shared: Arc::clone(&shared),
             clock,
@@ -307,7 +313,7 @@ impl Car {
             search_patience: Duration::ZERO,
         });
         Self {
-            clerk,
+            handler,
             shared,
             feed,
             filter,
@@ -318,23 +324,23 @@ impl Car {
     }
 
     /// Ends it; what survives comes back through the text that it is kept as.
-    fn stop(self) -> Memory {
-        let memory = self.clerk.keeper().memory().clone();
-        drop(self.clerk);
+    fn stop(self) -> PersistedState {
+        let memory = self.handler.store().persisted().clone();
+        drop(self.handler);
         drop(self.feed);
         self.filter.join().expect("the filter did not panic");
         self.shadow.join().expect("the shadow did not panic");
         let text = serde_json::to_string(&memory).expect("can be written");
-        let read: Memory = serde_json::from_str(&text).expect("can be read");
+        let read: PersistedState = serde_json::from_str(&text).expect("can be read");
         assert_eq!(read, memory);
         read
     }
 
     fn state(&self) -> State {
-        let keeper = self.clerk.keeper();
+        let store = self.handler.store();
         State {
-            memory: keeper.memory().clone(),
-            params: keeper.params(),
+            memory: store.persisted().clone(),
+            params: store.params(),
             rates: *self.shared.rates.lock().expect("sound"),
             auto: self.shared.advice.lock().expect("sound").auto,
             shadow: self.shared.shadow.lock().expect("sound").clone(),
@@ -349,7 +355,7 @@ impl Car {
             action,
             ..
         } = given;
-        let revision = self.clerk.keeper().reference().revision;
+        let revision = self.handler.store().reference().revision;
         Command {
             id: CommandId(id.into()),
             operator: match who {
@@ -372,7 +378,7 @@ impl Car {
     fn take(&mut self, topic: Topic, payload: Option<&[u8]>, tally: &mut Tally) {
         let before = self.state();
         let bad = self.shared.counters.read().payloads;
-        match self.clerk.answer(topic, payload) {
+        match self.handler.answer(topic, payload) {
             Ok(answer) => {
                 let (_, command) = decode::<Command>(payload.expect("was read")).expect("was read");
                 self.has_answered(&command, &answer, &before, tally);
@@ -390,7 +396,7 @@ impl Car {
     fn give(&mut self, under: Topic, command: &Command, tally: &mut Tally) {
         let before = self.state();
         let sound = encode(command, Stamps::default()).is_ok();
-        match self.clerk.answer(under, Some(&bytes_of(command))) {
+        match self.handler.answer(under, Some(&bytes_of(command))) {
             Ok(answer) => {
                 assert!(
                     sound && under == command.action.topic(),
@@ -400,7 +406,7 @@ impl Car {
                 // Given again, it is answered again, and nothing more is done.
                 let done = self.state();
                 let again = self
-                    .clerk
+                    .handler
                     .answer(under, Some(&bytes_of(command)))
                     .expect("as before");
                 assert_eq!(again[Header::LEN..], answer[Header::LEN..]);
@@ -421,9 +427,9 @@ impl Car {
         let after = self.state();
         let events = self.told();
         // The same command under the same id was done, or not, and is not done now; another one under it is refused.
-        let print = Some(Print::of(&bytes_of(command)[Header::LEN..]));
+        let payload_hash = Some(PayloadHash::of(&bytes_of(command)[Header::LEN..]));
         if let Some(known) = self.given.get(&command.id) {
-            if known.print == print {
+            if known.payload_hash == payload_hash {
                 assert_eq!(answer, known.answer);
             } else {
                 assert!(matches!(answer.outcome, Outcome::Refused { .. }), "{answer:?}");
@@ -431,12 +437,12 @@ impl Car {
             assert_eq!(after, *before, "{command:?} came again");
             return;
         }
-        let given = Answered {
+        let given = CachedAnswer {
             answer: answer.clone(),
-            print,
+            payload_hash,
         };
         self.given.insert(command.id, given);
-        assert_eq!(answer.set, self.clerk.keeper().reference());
+        assert_eq!(answer.set, self.handler.store().reference());
         match &answer.outcome {
             Outcome::Done { .. } => {
                 tally.done += 1;
@@ -468,7 +474,7 @@ impl Car {
     /// The events that would have gone out since. Each of them could have.
     fn told(&self) -> Vec<Event> {
         let mut events = Vec::new();
-        while let Some(record) = self.shared.outbox.next_record() {
+        while let Some(record) = self.shared.telemetry.next_record() {
             match record {
                 Record::Event(event) => {
                     let event = Event {
@@ -526,8 +532,8 @@ impl Car {
         assert!(state.params.revision >= self.revisions, "{state:?}");
         self.revisions = state.params.revision;
         assert!(encode(&state.params, Stamps::default()).is_ok());
-        let keeper = self.clerk.keeper();
-        keeper.in_force().parameters.validate().expect("in force");
+        let store = self.handler.store();
+        store.in_force().parameters.validate().expect("in force");
         for stored in state.memory.sets.values() {
             stored.parameters.validate().expect("on the car");
         }
@@ -538,8 +544,8 @@ impl Car {
                 assert!((0.0..=Rates::MAX).contains(&rate), "{rates:?}");
             }
         }
-        if let Some(belief) = *self.shared.belief.lock().expect("sound") {
-            assert!(belief.pose.is_finite(), "{belief:?}");
+        if let Some(estimate) = self.shared.latest_pose() {
+            assert!(estimate.pose.is_finite(), "{estimate:?}");
         }
     }
 }

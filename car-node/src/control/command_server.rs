@@ -1,0 +1,57 @@
+//! The thread that receives commands off the network, has the [`CommandHandler`] execute them, and replies.
+
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, select};
+use zenoh::Wait;
+
+use super::command_handler::{CommandHandler, CommandHandlerConfig};
+use super::request::Request;
+
+/// The handler's deadlines are checked this often.
+const TICK: Duration = Duration::from_millis(50);
+
+/// Starts the thread. It ends when `stop` is dropped.
+pub fn start(
+    config: CommandHandlerConfig,
+    requests: Receiver<Request>,
+    stop: Receiver<()>,
+) -> std::io::Result<JoinHandle<()>> {
+    thread::Builder::new()
+        .name("command-server".into())
+        .spawn(move || {
+            let mut handler = CommandHandler::new(config);
+            loop {
+                select! {
+                    recv(stop) -> _ => return,
+                    recv(requests) -> request => match request {
+                        Ok(request) => serve(&mut handler, &request),
+                        Err(_) => return,
+                    },
+                    default(TICK) => {}
+                }
+                handler.tick();
+            }
+        })
+}
+
+fn serve(handler: &mut CommandHandler, request: &Request) {
+    let Request { topic, query } = request;
+    let payload = query.payload().map(|payload| payload.to_bytes());
+    // A wildcard would reach every car at once.
+    let answer = if query.key_expr().is_wild() {
+        let error = "a command needs the key of one car, without wildcards";
+        Err(handler.count_unreadable(*topic, error.into()))
+    } else {
+        handler.answer(*topic, payload.as_deref())
+    };
+    let sent = match answer {
+        Ok(bytes) => query.reply(query.key_expr().clone(), bytes).wait(),
+        Err(error) => query.reply_err(error).wait(),
+    };
+    if let Err(error) = sent {
+        // The sender sees that no answer came, and repeats the command under the same id.
+        tracing::debug!(%error, "the reply could not be sent");
+    }
+}

@@ -1,0 +1,89 @@
+//! The thread that replies to queries which change nothing: the map, what runs here, and telemetry that did not arrive.
+//!
+//! It is separate from the command server, so that a map on its way over a slow link delays no command.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+
+use crossbeam_channel::{Receiver, select};
+use protocol::{MissingRequest, Stamps, Topic, decode, encode};
+use zenoh::Wait;
+
+use super::request::Request;
+use crate::sensors::clock::wall_now;
+use crate::telemetry::replay_buffer::ReplayBuffer;
+use crate::telemetry::shared_state::SharedState;
+
+/// What the replies are made from.
+#[derive(Debug)]
+pub struct QueryServer {
+    /// The reply to `map`, encoded.
+    pub map: Vec<u8>,
+    /// The reply to `info`, encoded.
+    pub info: Vec<u8>,
+    /// Telemetry that was sent.
+    pub replay_buffer: Arc<Mutex<ReplayBuffer>>,
+    /// Counts queries that cannot be decoded.
+    pub shared: Arc<SharedState>,
+    /// This run of the node.
+    pub run_id: u64,
+}
+
+impl QueryServer {
+    /// Starts the thread. It ends when `stop` is dropped.
+    pub fn start(self, requests: Receiver<Request>, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
+        thread::Builder::new().name("query-server".into()).spawn(move || {
+            loop {
+                select! {
+                    recv(stop) -> _ => return,
+                    recv(requests) -> request => match request {
+                        Ok(request) => self.serve(&request),
+                        Err(_) => return,
+                    },
+                }
+            }
+        })
+    }
+
+    fn serve(&self, Request { topic, query }: &Request) {
+        let payload = query.payload().map(|payload| payload.to_bytes());
+        let sent = match self.reply(*topic, payload.as_deref()) {
+            Ok(bytes) => query.reply(query.key_expr().clone(), bytes).wait(),
+            Err(error) => query.reply_err(error).wait(),
+        };
+        if let Err(error) = sent {
+            tracing::debug!(%error, "the reply could not be sent");
+        }
+    }
+
+    /// The encoded reply; an error names what is wrong with a query that cannot be decoded.
+    fn reply(&self, topic: Topic, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
+        match topic {
+            Topic::Map => Ok(self.map.clone()),
+            Topic::Info => Ok(self.info.clone()),
+            _ => self.missing(payload).inspect_err(|error| {
+                let count = self.shared.counters.bad_payload() + 1;
+                if count.is_power_of_two() {
+                    tracing::warn!(%topic, count, error, "a query cannot be read");
+                }
+            }),
+        }
+    }
+
+    fn missing(&self, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
+        let payload = payload.ok_or("this query needs a payload")?;
+        let (_, request) = decode::<MissingRequest>(payload).map_err(|error| error.to_string())?;
+        let replay_buffer = self.replay_buffer.lock().unwrap_or_else(PoisonError::into_inner);
+        let reply = replay_buffer.find(self.run_id, &request);
+        // Taken under the lock: what is published later is not in the reply's ranges.
+        let now = wall_now().0;
+        drop(replay_buffer);
+        let stamps = Stamps {
+            run_id: self.run_id,
+            sequence: 0,
+            sensor: now,
+            published: now,
+        };
+        encode(&reply, stamps).map_err(|error| error.to_string())
+    }
+}

@@ -1,0 +1,136 @@
+//! Which parameter set the odometry calls for.
+
+use std::collections::VecDeque;
+
+use serde::Serialize;
+use synpf::{Stamp, Update};
+
+use super::Thresholds;
+
+/// A set that the car would rather use.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Proposal {
+    /// `hq` or `lq`.
+    pub set: String,
+    /// Why, in words with numbers.
+    pub evidence: String,
+    /// Since when, on the sensors' clock.
+    pub since: Stamp,
+}
+
+/// What odometry is worth is judged over this long, about a lap of a small track [s].
+const WINDOW: f64 = 8.0;
+/// Nothing is proposed before this much of the window is driven [s].
+const ENOUGH: f64 = 3.0;
+/// LQ is proposed when more than this share of the scans slip...
+const SLIPPING: f64 = 0.20;
+/// ...and HQ when less than this does: the gap keeps the proposal from flickering.
+const GRIPPING: f64 = 0.05;
+/// Slower than this nothing can be said about slip [m/s].
+const SLOWEST: f64 = 0.5;
+
+/// Watches slip and yaw rate, update by update.
+#[derive(Debug, Default)]
+pub struct SetRecommender {
+    /// Driving scans of the last seconds: when, and whether odometry was wrong.
+    scans: VecDeque<(Stamp, bool)>,
+    /// The set that odometry calls for.
+    wanted: Option<Proposal>,
+}
+
+impl SetRecommender {
+    /// Takes in an update.
+    pub fn on_update(&mut self, update: &Update, thresholds: &Thresholds) {
+        if update.twist.linear_x.abs() < SLOWEST {
+            return;
+        }
+        let wrong = update.slip.abs() > thresholds.slip
+            || update.yaw_rate_residual.abs() > thresholds.yaw_rate_residual;
+        self.scans.push_back((update.stamp, wrong));
+        while self
+            .scans
+            .front()
+            .is_some_and(|(stamp, _)| update.stamp.since(*stamp) > WINDOW)
+        {
+            self.scans.pop_front();
+        }
+        let (Some((first, _)), count) = (self.scans.front(), self.scans.len() as f64) else {
+            return;
+        };
+        if update.stamp.since(*first) < ENOUGH {
+            return;
+        }
+        let share = self.scans.iter().filter(|(_, wrong)| *wrong).count() as f64 / count;
+        let set = match self.wanted.as_ref().map(|proposal| proposal.set.as_str()) {
+            _ if share > SLIPPING => "lq",
+            _ if share < GRIPPING => "hq",
+            Some("lq") => "lq",
+            Some(_) => "hq",
+            None => return,
+        };
+        let since = self
+            .wanted
+            .as_ref()
+            .filter(|proposal| proposal.set == set)
+            .map_or(update.stamp, |proposal| proposal.since);
+        self.wanted = Some(Proposal {
+            set: set.into(),
+            evidence: format!(
+                "odometry off in {:.0} % of the last {WINDOW:.0} s (slip over {:.0} % or yaw rate by {:.1} rad/s)",
+                share * 100.0,
+                thresholds.slip * 100.0,
+                thresholds.yaw_rate_residual
+            ),
+            since,
+        });
+    }
+
+    /// The set to use in place of `in_force`; None when that is right, or when it is neither `hq` nor `lq` and
+    /// so somebody's own choice.
+    pub fn proposal(&self, in_force: &str) -> Option<&Proposal> {
+        self.wanted
+            .as_ref()
+            .filter(|proposal| matches!(in_force, "hq" | "lq") && proposal.set != in_force)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::health::tests_support::good_update;
+
+    fn drive(advisor: &mut SetRecommender, from: f64, seconds: f64, slip: impl Fn(usize) -> f64) {
+        for scan in 0..(seconds * 40.0) as usize {
+            let mut update = good_update(Stamp(0).plus(from + scan as f64 / 40.0), 1);
+            update.twist.linear_x = 3.0;
+            update.slip = slip(scan);
+            advisor.on_update(&update, &Thresholds::default());
+        }
+    }
+
+    #[test]
+    fn slipping_calls_for_lq_and_grip_for_hq() {
+        let mut advisor = SetRecommender::default();
+        drive(&mut advisor, 0.0, 2.0, |_| 0.2);
+        assert_eq!(advisor.proposal("hq"), None, "too early to tell");
+        drive(&mut advisor, 2.0, 3.0, |_| 0.2);
+        assert_eq!(advisor.proposal("hq").expect("slips").set, "lq");
+        assert_eq!(advisor.proposal("lq"), None);
+        assert_eq!(advisor.proposal("my-own"), None);
+        drive(&mut advisor, 5.0, 10.0, |_| 0.01);
+        assert_eq!(advisor.proposal("lq").expect("grips").set, "hq");
+        assert_eq!(advisor.proposal("hq"), None);
+    }
+
+    #[test]
+    fn in_between_the_proposal_stays_what_it_was() {
+        let tenth = |scan: usize| if scan.is_multiple_of(10) { 0.2 } else { 0.0 };
+        let mut advisor = SetRecommender::default();
+        drive(&mut advisor, 0.0, 8.0, tenth);
+        assert_eq!(advisor.proposal("hq"), None);
+        assert_eq!(advisor.proposal("lq"), None);
+        drive(&mut advisor, 8.0, 8.0, |_| 0.2);
+        drive(&mut advisor, 16.0, 20.0, tenth);
+        assert_eq!(advisor.proposal("hq").expect("still").set, "lq");
+    }
+}

@@ -1,0 +1,44 @@
+//! What other threads may ask of the filter.
+
+use crossbeam_channel::Sender;
+use maps::Pose;
+use protocol::SetRef;
+use synpf::{Hypothesis, Tuning};
+
+/// A command that the filter executes between two updates. A reply's number is the first update under the change.
+#[derive(Debug)]
+pub enum FilterCommand {
+    /// Swap the parameter set.
+    SetParameters {
+        /// The set's name and revision, for proposals, laps and the shadow.
+        set: SetRef,
+        /// The set with its tables.
+        tuning: Box<Tuning>,
+        /// Receives the update.
+        reply: Sender<u64>,
+    },
+    /// Start again from a pose.
+    Initialize {
+        /// `map_from_base_link`.
+        pose: Pose,
+        /// Receives the update.
+        reply: Sender<Result<u64, String>>,
+    },
+    /// Search the whole map.
+    Relocalize {
+        /// Receives the update.
+        reply: Sender<u64>,
+    },
+    /// List what a search has found so far, best first.
+    Candidates {
+        /// Receives the candidates.
+        reply: Sender<Vec<Hypothesis>>,
+    },
+    /// Start from one of the candidates that were last listed.
+    SelectCandidate {
+        /// Counted from 1.
+        number: usize,
+        /// Receives the update, and the candidate's pose now.
+        reply: Sender<Result<(u64, Pose), String>>,
+    },
+}

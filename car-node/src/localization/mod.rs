@@ -1,0 +1,9 @@
+//! The localizer at work: the thread that owns it, the shadow set beside it, and laps.
+
+pub mod filter_command;
+pub mod filter_worker;
+pub mod lap_counter;
+mod pace;
+pub mod shadow;
+pub mod shadow_channel;
+mod views;

@@ -1,0 +1,450 @@
+//! A car: its threads, how they are wired, and how they end.
+//!
+//! ```text
+//! source --feed--> filter --telemetry queue--> publisher ==zenoh==> pit wall
+//!                    ^ filter commands                                 |
+//!              command server <=============== commands ==============+
+//! ```
+
+mod queryables;
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crossbeam_channel::{Sender, bounded};
+use maps::{Pose, Raceline};
+use protocol::{CarInfo, CarName, EventKind, Rates, Stamps, encode};
+use synpf::{PoseError, SetUpError, SynPf, TrackMap};
+use zenoh::Session;
+use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::Subscriber;
+use zenoh::query::Queryable;
+
+use crate::control::parameter_sets::{self, NamedSet, SetError};
+use crate::control::parameter_store::ParameterStore;
+use crate::control::persisted_state::PersistedState;
+use crate::control::query_server::QueryServer;
+use crate::control::{CommandHandlerConfig, SEARCH_PATIENCE, StateFile, StateFileError, command_server};
+use crate::health::{Monitor, Thresholds};
+use crate::localization::filter_worker::{self, FilterConfig};
+use crate::localization::shadow;
+use crate::localization::shadow_channel::shadow_channel;
+use crate::network::{self, NetworkError};
+use crate::sensors::clock::{SensorClock, wall_now};
+use crate::sensors::{self, PoseEstimate, Source};
+use crate::telemetry::load;
+use crate::telemetry::publisher::Publisher;
+use crate::telemetry::replay_buffer::ReplayBuffer;
+use crate::telemetry::shared_state::{DEFAULT_RATES, SharedState};
+use crate::wire;
+
+/// Where a car begins.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Begin {
+    /// Here: `map_from_base_link`.
+    Pose(Pose),
+    /// Where the source says, as a simulator does and a bag with ground truth.
+    Source,
+    /// It searches the map.
+    Global,
+}
+
+/// A map ready to race on.
+#[derive(Debug, Clone)]
+pub struct RaceMap {
+    /// What to call it.
+    pub name: String,
+    /// The map, shared between the cars of one process.
+    pub map: Arc<TrackMap>,
+    /// The line to measure progress along.
+    pub raceline: Option<Arc<Raceline>>,
+}
+
+/// What a car needs to run.
+pub struct NodeConfig {
+    /// Its name.
+    pub car: CarName,
+    /// Its map.
+    pub map: RaceMap,
+    /// Its sensors.
+    pub source: Box<dyn Source>,
+    /// How many times as fast as real time a recording is played.
+    pub rate: f64,
+    /// The set to start with; None for the one that was in force when the car last ran, and `hq` for a new car.
+    pub set: Option<NamedSet>,
+    /// Where it begins.
+    pub begin: Begin,
+    /// Seed of the filter.
+    pub seed: u64,
+    /// Endpoints of pit walls, such as `tcp/192.168.1.10:7447`; empty looks for one on this machine and, by
+    /// multicast, on the local network.
+    pub connect: Vec<String>,
+    /// How often to send what.
+    pub rates: Rates,
+    /// Send poses at odometry rate, predicted, and not only at scan rate.
+    pub predict: bool,
+    /// What counts as good.
+    pub thresholds: Thresholds,
+    /// Folder for what survives a restart; None forgets.
+    pub state: Option<PathBuf>,
+    /// Receives every pose estimate while the car is localized, such as for the car's controller.
+    pub pose_sink: Option<Sender<PoseEstimate>>,
+}
+
+impl NodeConfig {
+    /// A car with everything else as usual.
+    pub fn new(car: CarName, map: RaceMap, source: Box<dyn Source>) -> Self {
+        Self {
+            car,
+            map,
+            source,
+            rate: 1.0,
+            set: None,
+            begin: Begin::Source,
+            seed: 0,
+            connect: Vec::new(),
+            rates: DEFAULT_RATES,
+            predict: false,
+            thresholds: Thresholds::default(),
+            state: None,
+            pose_sink: None,
+        }
+    }
+}
+
+/// Why a car does not start.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeError {
+    /// The localizer refuses its set-up.
+    #[error(transparent)]
+    SetUp(#[from] SetUpError),
+    /// The pose to start from cannot be.
+    #[error(transparent)]
+    Pose(#[from] PoseError),
+    /// The set that was in force is gone.
+    #[error(transparent)]
+    Set(#[from] SetError),
+    /// The network cannot be used.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// The state folder cannot be used.
+    #[error(transparent)]
+    State(#[from] StateFileError),
+    /// A message about the car itself does not encode, such as a map that is too large.
+    #[error("{0}")]
+    Message(#[from] protocol::CodecError),
+    /// A thread does not start.
+    #[error("cannot start a thread: {0}")]
+    Thread(#[from] std::io::Error),
+    /// The source does not know the car's first pose.
+    #[error("the source does not know the first pose; give --initial-pose x,y,heading")]
+    NoStart,
+    /// The playback rate is not positive.
+    #[error("the rate {0} is not positive")]
+    Rate(f64),
+}
+
+/// A running car. Dropping it without [`Node::shutdown`] leaves its threads to end by themselves.
+pub struct Node {
+    shared: Arc<SharedState>,
+    clock: SensorClock,
+    session: Session,
+    /// Dropping these ends the threads that listen to them.
+    stop_source: Sender<()>,
+    stop_control: Sender<()>,
+    stop_publisher: Sender<()>,
+    source: JoinHandle<()>,
+    filter: JoinHandle<()>,
+    command_server: JoinHandle<()>,
+    query_server: JoinHandle<()>,
+    load: JoinHandle<()>,
+    shadow: JoinHandle<()>,
+    publisher: JoinHandle<()>,
+    queryables: Vec<Queryable<()>>,
+    link_reports: Subscriber<()>,
+    alive: LivelinessToken,
+}
+
+/// Closing the zenoh session on a dead link takes long; the node waits this long at most.
+const CLOSING: Duration = Duration::from_secs(2);
+/// Commands and queries that wait.
+const QUEUE: usize = 64;
+
+impl Node {
+    /// Starts a car. It is on the network when this returns, if there is one; else it goes on trying.
+    #[expect(
+        clippy::too_many_lines,
+        reason = "the wiring of the threads, from top to bottom, reads best in one piece"
+    )]
+    pub fn start(config: NodeConfig) -> Result<Self, NodeError> {
+        let NodeConfig {
+            car,
+            map,
+            mut source,
+            rate,
+            set,
+            begin,
+            seed,
+            connect,
+            rates,
+            predict,
+            thresholds,
+            state,
+            pose_sink,
+        } = config;
+        if !(rate.is_finite() && rate > 0.0) {
+            return Err(NodeError::Rate(rate));
+        }
+        let file = state.map(|folder| StateFile::in_folder(&folder)).transpose()?;
+        let persisted = file
+            .as_ref()
+            .map_or(Ok(PersistedState::default()), StateFile::read)?;
+        let set = first_set(set, &persisted)?;
+        let mount = source.mount();
+        let mut localizer = SynPf::new(
+            Arc::clone(&map.map),
+            mount.base_link_from_laser,
+            set.parameters.clone(),
+            seed,
+        )?;
+        let known = match begin {
+            Begin::Pose(pose) => Some(pose),
+            Begin::Source => source.start(),
+            Begin::Global => None,
+        };
+        map.map.prepare(known, &set.parameters);
+        let begins_with_a_pose = begin_at(&mut localizer, begin, source.start())?;
+
+        let session = network::open(&connect)?;
+        let started = wall_now();
+        let run_id = started.0.unsigned_abs();
+        let shared = Arc::new(SharedState {
+            rates: Mutex::new(rates),
+            ..SharedState::default()
+        });
+        let clock = source.clock(rate);
+        let (map_message, info) = describe(&map, source.as_ref(), started)?;
+
+        let replay_buffer = Arc::<Mutex<ReplayBuffer>>::default();
+        let publisher = Publisher::new(
+            &session,
+            &car,
+            run_id,
+            clock,
+            Arc::clone(&shared),
+            Arc::clone(&replay_buffer),
+        )?;
+        let (stop_publisher, publisher_stops) = bounded(0);
+        let (stop_source, source_stops) = bounded(0);
+        let (stop_control, control_stops) = bounded(0);
+        let (feed, filter_feed) = bounded(sensors::QUEUE);
+        let (to_filter, filter_commands) = bounded(QUEUE);
+        let (to_command_server, command_requests) = bounded(QUEUE);
+        let (to_query_server, query_requests) = bounded(QUEUE);
+        let (to_shadow, shadow_commands) = bounded(QUEUE);
+        let (shadow_sender, shadow_receiver) = shadow_channel();
+        let store = ParameterStore::new(persisted, set.name, set.parameters, started);
+
+        shared.event(
+            clock.now(),
+            0,
+            EventKind::Started {
+                version: env!("CARGO_PKG_VERSION").into(),
+            },
+            None,
+            None,
+        );
+        let publisher = publisher.start(publisher_stops)?;
+        let mut monitor = Monitor::new(thresholds, clock.now());
+        if begins_with_a_pose {
+            monitor.on_new_pose(clock.now());
+        } else {
+            monitor.on_search(clock.now());
+        }
+        let filter = filter_worker::start(
+            FilterConfig {
+                localizer,
+                map: Arc::clone(&map.map),
+                monitor,
+                base_link_from_laser: mount.base_link_from_laser,
+                raceline: map.raceline,
+                clock,
+                set: store.reference(),
+                predict,
+                shared: Arc::clone(&shared),
+                shadow: shadow_sender,
+                pose_sink,
+            },
+            filter_feed,
+            filter_commands,
+        )?;
+        let shadow = shadow::start(shadow_receiver, shadow_commands, Arc::clone(&shared), clock)?;
+        let command_server = command_server::start(
+            CommandHandlerConfig {
+                store,
+                file,
+                filter_commands: to_filter,
+                shadow_commands: to_shadow,
+                base_link_from_laser: mount.base_link_from_laser,
+                shared: Arc::clone(&shared),
+                clock,
+                run_id,
+                track_map: map.map,
+                search_patience: SEARCH_PATIENCE,
+            },
+            command_requests,
+            control_stops.clone(),
+        )?;
+        let query_server = QueryServer {
+            map: map_message,
+            info,
+            replay_buffer,
+            shared: Arc::clone(&shared),
+            run_id,
+        };
+        let query_server = query_server.start(query_requests, control_stops.clone())?;
+        let load = load::start(Arc::clone(&shared), control_stops)?;
+        let queryables = queryables::declare(
+            &session,
+            &car,
+            run_id,
+            &to_command_server,
+            &to_query_server,
+            &shared,
+        )?;
+        let link_reports = queryables::subscribe_to_link_reports(&session, &car, &shared, clock)?;
+        let alive = network::declare_alive(&session, &car)?;
+        // The sensors start last: the pit wall can then see the first scan.
+        let counters = Arc::clone(&shared.counters);
+        let source = sensors::play(
+            source,
+            clock,
+            feed,
+            Arc::clone(&shared.pose),
+            move || counters.overrun(),
+            source_stops,
+        )?;
+        Ok(Self {
+            shared,
+            clock,
+            session,
+            stop_source,
+            stop_control,
+            stop_publisher,
+            source,
+            filter,
+            command_server,
+            query_server,
+            load,
+            shadow,
+            publisher,
+            queryables,
+            link_reports,
+            alive,
+        })
+    }
+
+    /// True when the source has delivered all it has.
+    pub fn source_ended(&self) -> bool {
+        self.source.is_finished()
+    }
+
+    /// The state that the threads share: counters, rates, the latest pose.
+    pub fn shared(&self) -> &Arc<SharedState> {
+        &self.shared
+    }
+
+    /// Ends the car: the sensors first, the network last, so that the last events still go out. Takes a few seconds at most,
+    /// whatever the link does.
+    pub fn shutdown(self, reason: &str) {
+        drop(self.stop_source);
+        join(self.source);
+        self.shared.event(
+            self.clock.now(),
+            0,
+            EventKind::Stopping {
+                reason: reason.into(),
+            },
+            None,
+            None,
+        );
+        drop(self.stop_control);
+        join(self.command_server);
+        join(self.query_server);
+        // The filter ends with the last sender of commands, which the command server held.
+        join(self.filter);
+        join(self.load);
+        join(self.shadow);
+        drop(self.stop_publisher);
+        join(self.publisher);
+        drop(self.queryables);
+        drop(self.link_reports);
+        drop(self.alive);
+        network::close(&self.session, CLOSING);
+    }
+}
+
+fn join(thread: JoinHandle<()>) {
+    let name = thread.thread().name().unwrap_or_default().to_owned();
+    if thread.join().is_err() {
+        tracing::error!(thread = name, "a thread has panicked");
+    }
+}
+
+/// The answers to `map` and `info`.
+fn describe(
+    map: &RaceMap,
+    source: &dyn Source,
+    started: synpf::Stamp,
+) -> Result<(Vec<u8>, Vec<u8>), protocol::CodecError> {
+    let run_id = started.0.unsigned_abs();
+    let stamps = Stamps {
+        run_id,
+        sequence: 1,
+        sensor: started.0,
+        published: started.0,
+    };
+    let info = CarInfo {
+        version: env!("CARGO_PKG_VERSION").into(),
+        started: run_id,
+        source: source.description(),
+        map: map.name.clone(),
+        lap_length: map.raceline.as_ref().map(|line| line.length()),
+        base_link_from_laser: wire::pose2(source.mount().base_link_from_laser),
+        host: sysinfo::System::host_name().unwrap_or_default(),
+    };
+    let map = wire::map(&map.name, map.map.grid(), map.raceline.as_deref());
+    Ok((encode(&map, stamps)?, encode(&info, stamps)?))
+}
+
+/// The set to start with.
+fn first_set(wanted: Option<NamedSet>, persisted: &PersistedState) -> Result<NamedSet, SetError> {
+    if let Some(set) = wanted {
+        return Ok(set);
+    }
+    let name = persisted.settled.as_deref().unwrap_or("hq");
+    if let Some(stored) = persisted.sets.get(name) {
+        return Ok(NamedSet {
+            name: name.into(),
+            parameters: stored.parameters.clone(),
+            unknown_keys: Vec::new(),
+        });
+    }
+    // A set from a file is not on the car; without its file, the usual one.
+    parameter_sets::load(name).or_else(|_| parameter_sets::load("hq"))
+}
+
+/// Gives the localizer its start. True when that is a pose.
+fn begin_at(localizer: &mut SynPf, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
+    match begin {
+        Begin::Pose(pose) => localizer.initialize(pose)?,
+        Begin::Source => localizer.initialize(start.ok_or(NodeError::NoStart)?)?,
+        Begin::Global => {
+            localizer.relocalize();
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}

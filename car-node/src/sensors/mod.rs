@@ -1,0 +1,123 @@
+//! Where sensor data comes from: recorded, simulated or live. One thread sends each message to the filter when it is due.
+
+pub mod bag;
+mod bag_player;
+pub mod clock;
+pub mod frames;
+mod ros2;
+mod simulated;
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TrySendError};
+use maps::Pose;
+use synpf::{Stamp, Twist};
+
+pub use bag_player::BagPlayer;
+pub use ros2::{Ros2, Ros2Error, Ros2Options};
+pub use simulated::{Incident, Race, Script, ScriptedIncident, SimulatedCar};
+
+use self::bag::SensorEvent;
+use self::clock::SensorClock;
+use self::frames::Mount;
+
+/// What a source delivers.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Feed {
+    /// A message for the filter.
+    Sensor(SensorEvent),
+    /// Ground truth, for the recorder.
+    Truth(TrueMotion),
+    /// A message for the log, such as a crash.
+    Log(String),
+    /// An initial pose from outside, such as from a recovery crew or `RViz`.
+    InitialPose(Pose),
+}
+
+/// The car's true motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrueMotion {
+    /// When it is true.
+    pub stamp: Stamp,
+    /// `map_from_base_link`.
+    pub pose: Pose,
+    /// Velocity.
+    pub twist: Twist,
+}
+
+/// The pose that the localizer estimates. A simulated driver steers by it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseEstimate {
+    /// When it is true, on the sensors' clock.
+    pub stamp: Stamp,
+    /// `map_from_base_link`.
+    pub pose: Pose,
+    /// Velocity.
+    pub twist: Twist,
+}
+
+/// What a source has next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// A message, and when it arrives.
+    Due(Stamp, Feed),
+    /// Nothing has come for a while; more may come.
+    Quiet,
+    /// Nothing more will come.
+    End,
+}
+
+/// Delivers a car's sensor data in the order in which it arrives.
+pub trait Source: Send {
+    /// A description for people.
+    fn description(&self) -> String;
+    /// How the laser is mounted.
+    fn mount(&self) -> Mount;
+    /// The sensors' clock. It starts now and runs `rate` times as fast as this machine's.
+    fn clock(&mut self, rate: f64) -> SensorClock;
+    /// The car's first pose, if the source knows it.
+    fn start(&self) -> Option<Pose>;
+    /// Waits for the next message, a tenth of a second at most. `estimate` is the filter's latest.
+    fn next(&mut self, estimate: Option<PoseEstimate>) -> Next;
+}
+
+/// The latest pose estimate: the filter writes it, the source reads it.
+pub type SharedPose = Arc<Mutex<Option<PoseEstimate>>>;
+
+/// Messages that wait for the filter: a quarter of a second of all sensors.
+pub const QUEUE: usize = 64;
+
+/// Starts the thread that plays `source` into `filter` by `clock`.
+///
+/// It ends with the source, when the filter is gone, or when `stop` is dropped. A message that finds the queue full is
+/// dropped, and `on_overrun` is called: a late filter needs new data more than old data.
+pub fn play(
+    mut source: Box<dyn Source>,
+    clock: SensorClock,
+    filter: Sender<Feed>,
+    estimate: SharedPose,
+    on_overrun: impl Fn() + Send + 'static,
+    stop: Receiver<()>,
+) -> std::io::Result<JoinHandle<()>> {
+    thread::Builder::new().name("source".into()).spawn(move || {
+        loop {
+            let latest = *estimate.lock().unwrap_or_else(PoisonError::into_inner);
+            let (wait, feed) = match source.next(latest) {
+                Next::Due(due, feed) => (clock.until(due), Some(feed)),
+                Next::Quiet => (Duration::ZERO, None),
+                Next::End => return,
+            };
+            if stop.recv_timeout(wait) != Err(RecvTimeoutError::Timeout) {
+                return;
+            }
+            let Some(feed) = feed else { continue };
+            match filter.try_send(feed) {
+                Ok(()) => {}
+                Err(TrySendError::Full(_)) => on_overrun(),
+                Err(TrySendError::Disconnected(_)) => return,
+            }
+        }
+    })
+}

@@ -1,0 +1,210 @@
+//! The telemetry thread: takes what the others have left, and sends it. A slow network slows down nobody else.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use crossbeam_channel::{Receiver, TryRecvError};
+use protocol::{CarName, Message, Stamps, Topic, encode};
+use synpf::Stamp;
+use zenoh::{Session, Wait};
+
+use crate::network::{self, NetworkError};
+use crate::sensors::clock::{SensorClock, wall_now};
+use crate::telemetry::queue::Record;
+use crate::telemetry::replay_buffer::ReplayBuffer;
+use crate::telemetry::shared_state::SharedState;
+use crate::wire;
+
+/// Everything that goes out.
+pub const TOPICS: [Topic; 13] = [
+    Topic::Pose,
+    Topic::Cloud,
+    Topic::Scan,
+    Topic::Health,
+    Topic::Load,
+    Topic::Params,
+    Topic::Shadow,
+    Topic::Event,
+    Topic::RecordedPose,
+    Topic::RecordedHealth,
+    Topic::RecordedOdometry,
+    Topic::RecordedScan,
+    Topic::RecordedTruth,
+];
+
+/// Looks for a stop at least this often.
+const TICK: Duration = Duration::from_millis(50);
+
+/// One topic's way out, and how many messages have taken it.
+struct TopicPublisher {
+    outlet: zenoh::pubsub::Publisher<'static>,
+    sequence: u64,
+}
+
+/// Sends a car's telemetry.
+pub struct Publisher {
+    streams: HashMap<Topic, TopicPublisher>,
+    run_id: u64,
+    clock: SensorClock,
+    shared: Arc<SharedState>,
+    replay_buffer: Arc<Mutex<ReplayBuffer>>,
+    failed: HashMap<Topic, u64>,
+}
+
+impl Publisher {
+    /// Declares every topic on `session`. `run_id` tells this run of the node from others.
+    pub fn new(
+        session: &Session,
+        car: &CarName,
+        run_id: u64,
+        clock: SensorClock,
+        shared: Arc<SharedState>,
+        replay_buffer: Arc<Mutex<ReplayBuffer>>,
+    ) -> Result<Self, NetworkError> {
+        let streams = TOPICS
+            .into_iter()
+            .map(|topic| {
+                let outlet = network::declare_publisher(session, car, topic)?;
+                Ok((topic, TopicPublisher { outlet, sequence: 0 }))
+            })
+            .collect::<Result<_, NetworkError>>()?;
+        Ok(Self {
+            streams,
+            run_id,
+            clock,
+            shared,
+            replay_buffer,
+            failed: HashMap::new(),
+        })
+    }
+
+    /// Starts the thread. Once `stop` is dropped it sends what is left, and ends.
+    pub fn start(mut self, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
+        thread::Builder::new().name("publisher".into()).spawn(move || {
+            while stop.try_recv() == Err(TryRecvError::Empty) {
+                self.shared.telemetry.wait(TICK);
+                self.flush();
+            }
+            self.flush();
+        })
+    }
+
+    /// Sends all that is there, the pose first.
+    fn flush(&mut self) {
+        let shared = Arc::clone(&self.shared);
+        if let Some(pose) = shared.telemetry.take_pose() {
+            self.send(
+                Topic::Pose,
+                self.clock.wall(pose.stamp),
+                &wire::pose_message(&pose),
+            );
+            shared
+                .counters
+                .published(self.clock.now().since(pose.stamp).max(0.0));
+        }
+        while let Some(record) = shared.telemetry.next_record() {
+            self.send_record(record);
+        }
+        if let Some(cloud) = shared.telemetry.take_cloud() {
+            self.send(Topic::Cloud, self.clock.wall(cloud.stamp), &wire::cloud(&cloud));
+        }
+        if let Some(scan) = shared.telemetry.take_scan() {
+            self.send(Topic::Scan, self.clock.wall(scan.stamp), &wire::scan_view(&scan));
+        }
+    }
+
+    fn send_record(&mut self, record: Record) {
+        match record {
+            Record::Pose(pose) => self.send(
+                Topic::RecordedPose,
+                self.clock.wall(pose.stamp),
+                &wire::pose_message(&pose),
+            ),
+            Record::Health {
+                report,
+                live,
+                recorded,
+            } => {
+                let stamp = self.clock.wall(report.stamp);
+                let message = wire::health(&report, &self.clock);
+                if live {
+                    self.send(Topic::Health, stamp, &message);
+                }
+                if recorded {
+                    self.send(Topic::RecordedHealth, stamp, &message);
+                }
+            }
+            Record::Odometry(odometry) => self.send(
+                Topic::RecordedOdometry,
+                self.clock.wall(odometry.stamp),
+                &wire::odometry(&odometry),
+            ),
+            Record::Scan(scan) => {
+                self.send(
+                    Topic::RecordedScan,
+                    self.clock.wall(scan.stamp),
+                    &wire::scan(&scan),
+                );
+            }
+            Record::Truth(truth) => self.send(
+                Topic::RecordedTruth,
+                self.clock.wall(truth.stamp),
+                &wire::truth(&truth),
+            ),
+            Record::Params(params) => self.send(Topic::Params, wall_now(), params.as_ref()),
+            Record::Shadow(shadow) => self.send(Topic::Shadow, wall_now(), shadow.as_ref()),
+            Record::Load(load) => self.send(Topic::Load, wall_now(), load.as_ref()),
+            Record::Event(event) => self.send(
+                Topic::Event,
+                self.clock.wall(event.stamp),
+                &protocol::Event {
+                    kind: event.kind,
+                    update: event.update,
+                    who: event.who,
+                    command: event.command,
+                },
+            ),
+        }
+    }
+
+    /// Sends a message. One of a stream that must be whole is kept, too, and while the link is too slow for it, only kept.
+    fn send<M: Message>(&mut self, topic: Topic, sensor: Stamp, message: &M) {
+        let Some(stream) = self.streams.get_mut(&topic) else {
+            return;
+        };
+        let stamps = Stamps {
+            run_id: self.run_id,
+            sequence: stream.sequence + 1,
+            sensor: sensor.0,
+            published: wall_now().0,
+        };
+        let sent = encode(message, stamps)
+            .map_err(|error| error.to_string())
+            .and_then(|bytes| {
+                stream.sequence += 1;
+                if topic.recovered() {
+                    let mut replay_buffer = self.replay_buffer.lock().unwrap_or_else(PoisonError::into_inner);
+                    replay_buffer.keep(topic, stream.sequence, bytes.clone());
+                    let throttle = self
+                        .shared
+                        .throttle
+                        .lock()
+                        .unwrap_or_else(PoisonError::into_inner);
+                    if topic.recorded() && throttle.parked() {
+                        return Ok(());
+                    }
+                }
+                stream.outlet.put(bytes).wait().map_err(|error| error.to_string())
+            });
+        if let Err(error) = sent {
+            let failed = self.failed.entry(topic).or_default();
+            *failed += 1;
+            // Once, and then at every power of two: a fault at 40 Hz must not fill the disk.
+            if failed.is_power_of_two() {
+                tracing::warn!(%topic, failed, error, "a message did not go out");
+            }
+        }
+    }
+}

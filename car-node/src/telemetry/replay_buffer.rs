@@ -1,0 +1,163 @@
+//! What was sent, for those who did not get it. Pure: no network, no clock.
+//!
+//! A stream that must be whole is kept here while it is sent, message by message under its number. A pit wall that lacks
+//! some asks for them ([`MissingRequest`]) in pieces, at its own pace.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::{Kept, MissingReply, MissingRequest, Resent, Topic};
+
+/// How much is kept of each stream [bytes]: at the full rate of a car with 1081 beams, some four minutes of scans, and of the
+/// others far more.
+const MOST: usize = 24 * 1024 * 1024;
+
+/// Messages by stream and number.
+#[derive(Debug, Default)]
+pub struct ReplayBuffer(BTreeMap<Topic, StreamBuffer>);
+
+/// One stream. Its numbers have no holes.
+#[derive(Debug, Default)]
+struct StreamBuffer {
+    /// Number of the oldest message.
+    first: u64,
+    messages: VecDeque<Vec<u8>>,
+    bytes: usize,
+}
+
+impl ReplayBuffer {
+    /// Keeps a message. What came before it and has no room any more goes.
+    pub fn keep(&mut self, topic: Topic, sequence: u64, bytes: Vec<u8>) {
+        let stream = self.0.entry(topic).or_default();
+        if sequence != stream.first + stream.messages.len() as u64 {
+            *stream = StreamBuffer {
+                first: sequence,
+                ..StreamBuffer::default()
+            };
+        }
+        stream.bytes += bytes.len();
+        stream.messages.push_back(bytes);
+        while stream.bytes > MOST && stream.messages.len() > 1 {
+            let gone = stream.messages.pop_front().map_or(0, |oldest| oldest.len());
+            stream.bytes -= gone;
+            stream.first += 1;
+        }
+    }
+
+    /// What there is of what is missing, as much of it as the budget allows. `run_id` is this run of the node.
+    pub fn find(&self, run_id: u64, request: &MissingRequest) -> MissingReply {
+        let streams = self.0.iter().map(|(topic, stream)| Kept {
+            topic: *topic,
+            first: stream.first,
+            last: stream.first + stream.messages.len() as u64 - 1,
+        });
+        let budget = request.budget.min(MissingRequest::MAX_BUDGET) as usize;
+        let mut spent = 0;
+        let wanted = request
+            .streams
+            .iter()
+            .filter(|_| request.run_id == run_id)
+            .filter_map(|wanted| Some((wanted.topic, &wanted.ranges, self.0.get(&wanted.topic)?)))
+            .flat_map(|(topic, ranges, stream)| stream.within(ranges).map(move |bytes| (topic, bytes)));
+        let messages = wanted
+            .take_while(|(_, bytes)| {
+                spent += bytes.len();
+                spent <= budget || spent == bytes.len()
+            })
+            .map(|(topic, bytes)| Resent {
+                topic,
+                bytes: bytes.to_vec(),
+            })
+            .collect();
+        MissingReply {
+            streams: streams.collect(),
+            messages,
+        }
+    }
+}
+
+impl StreamBuffer {
+    /// The messages in these ranges, range by range.
+    fn within<'a>(&'a self, ranges: &'a [[u64; 2]]) -> impl Iterator<Item = &'a [u8]> {
+        let end = self.first + self.messages.len() as u64;
+        ranges.iter().flat_map(move |[from, to]| {
+            let from = (*from).clamp(self.first, end);
+            let to = to.saturating_add(1).clamp(from, end);
+            let at = |number| (number - self.first) as usize;
+            self.messages.range(at(from)..at(to)).map(Vec::as_slice)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::Wanted;
+
+    const RUN: u64 = 7;
+
+    fn archive(numbers: std::ops::RangeInclusive<u64>, len: usize) -> ReplayBuffer {
+        let mut archive = ReplayBuffer::default();
+        for number in numbers {
+            archive.keep(Topic::Event, number, vec![number as u8; len]);
+        }
+        archive
+    }
+
+    fn ask(archive: &ReplayBuffer, run_id: u64, ranges: &[[u64; 2]], budget: u32) -> MissingReply {
+        let request = MissingRequest {
+            run_id,
+            streams: vec![Wanted {
+                topic: Topic::Event,
+                ranges: ranges.to_vec(),
+            }],
+            budget,
+        };
+        archive.find(RUN, &request)
+    }
+
+    fn numbers(reply: &MissingReply) -> Vec<u8> {
+        reply.messages.iter().map(|message| message.bytes[0]).collect()
+    }
+
+    #[test]
+    fn what_is_missing_comes_in_order_and_within_the_budget() {
+        let archive = archive(1..=9, 100);
+        let reply = ask(&archive, RUN, &[[2, 3], [6, 20]], 1000);
+        assert_eq!(numbers(&reply), [2, 3, 6, 7, 8, 9]);
+        let kept = Kept {
+            topic: Topic::Event,
+            first: 1,
+            last: 9,
+        };
+        assert_eq!(reply.streams, [kept]);
+        assert_eq!(numbers(&ask(&archive, RUN, &[[2, 3], [6, 20]], 399)), [2, 3, 6]);
+        assert_eq!(
+            numbers(&ask(&archive, RUN, &[[4, 9]], 0)),
+            [4],
+            "one comes in any case"
+        );
+    }
+
+    #[test]
+    fn absurd_questions_are_answered_with_what_there_is() {
+        let archive = archive(5..=6, 1);
+        for ranges in [[0, u64::MAX], [0, 5], [6, 6], [7, u64::MAX], [0, 4]] {
+            let expected: Vec<u8> = (5..=6)
+                .filter(|n| (ranges[0]..=ranges[1]).contains(n))
+                .map(|n| n as u8)
+                .collect();
+            assert_eq!(numbers(&ask(&archive, RUN, &[ranges], u32::MAX)), expected);
+        }
+        let other = ask(&archive, RUN + 1, &[[0, 9]], u32::MAX);
+        assert_eq!(other.messages, [], "numbers of another run of the node");
+        assert_eq!((other.streams[0].first, other.streams[0].last), (5, 6));
+    }
+
+    #[test]
+    fn the_oldest_go_when_it_is_full() {
+        let archive = archive(1..=30, 1 << 20);
+        let reply = ask(&archive, RUN, &[[1, 30]], 0);
+        assert_eq!((reply.streams[0].first, reply.streams[0].last), (7, 30));
+        assert_eq!(numbers(&reply), [7]);
+    }
+}

@@ -387,6 +387,8 @@ fn parameter_set(name: &str, parameters: &Parameters) -> ParameterSet {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
     use protocol::Value;
 

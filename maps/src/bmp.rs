@@ -2,11 +2,11 @@
 
 use crate::raster::{Raster, check_size};
 
-/// Length of the file header, which the bitmap header follows [bytes].
+/// Length of the file header, which the bitmap header follows \[bytes\].
 const FILE_HEADER: usize = 14;
-/// Length of the oldest bitmap header, with 16-bit sizes [bytes].
+/// Length of the oldest bitmap header, with 16-bit sizes \[bytes\].
 const CORE_HEADER: usize = 12;
-/// Length of the bitmap header that all later ones begin with [bytes].
+/// Length of the bitmap header that all later ones begin with \[bytes\].
 const INFO_HEADER: usize = 40;
 
 /// Reads a bitmap. Pixels become red, green, blue and alpha.

@@ -23,16 +23,16 @@ pub struct DistanceField {
     height: usize,
     resolution: f64,
     grid_from_map: Pose,
-    /// Signed distance at each cell's centre [m].
+    /// Signed distance at each cell's centre \[m\].
     values: Vec<f32>,
-    /// Distance of the zero from the face, into the wall [m]; empty if it lies on the face everywhere.
+    /// Distance of the zero from the face, into the wall \[m\]; empty if it lies on the face everywhere.
     inwards: Vec<f32>,
 }
 
 /// The field at one point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// Signed distance [m].
+    /// Signed distance \[m\].
     pub distance: f32,
     /// Its gradient along the *grid's* axes, of length about 1.
     pub gradient: [f32; 2],
@@ -69,7 +69,7 @@ impl DistanceField {
         }
     }
 
-    /// The field and its gradient at a point in grid coordinates [cells]; None outside the grid.
+    /// The field and its gradient at a point in grid coordinates \[cells\]; None outside the grid.
     #[inline]
     pub fn sample(&self, u: f32, v: f32) -> Option<Sample> {
         let (u, v) = (u - 0.5, v - 0.5);
@@ -89,7 +89,7 @@ impl DistanceField {
         })
     }
 
-    /// The sample of the cell that contains a point in grid coordinates [cells], in metres; None outside the grid.
+    /// The sample of the cell that contains a point in grid coordinates \[cells\], in metres; None outside the grid.
     #[inline]
     pub fn nearest(&self, u: f32, v: f32) -> Option<f32> {
         if !(u >= 0.0 && v >= 0.0) {
@@ -100,7 +100,7 @@ impl DistanceField {
     }
 
     /// Distance from the wall's near face, on either side of it, of the cell that contains a point in grid coordinates
-    /// [cells], in metres; None outside the grid.
+    /// \[cells\], in metres; None outside the grid.
     #[inline]
     pub fn from_wall(&self, u: f32, v: f32) -> Option<f32> {
         if !(u >= 0.0 && v >= 0.0) {
@@ -114,7 +114,7 @@ impl DistanceField {
         })
     }
 
-    /// Path from `start` along the unit vector `direction` to the first wall's face [cells], at most `longest`
+    /// Path from `start` along the unit vector `direction` to the first wall's face \[cells\], at most `longest`
     /// (sphere tracing; Hart, The Visual Computer 12, 1996). 0 if the start is not in free space.
     pub fn trace(&self, start: [f32; 2], direction: [f32; 2], longest: f32) -> f32 {
         let cells = 1.0 / self.resolution as f32;
@@ -139,7 +139,7 @@ impl DistanceField {
         longest
     }
 
-    /// The walls' faces: segments of the field's zero line in grid coordinates [cells], in no order.
+    /// The walls' faces: segments of the field's zero line in grid coordinates \[cells\], in no order.
     pub fn contour(&self) -> Vec<[[f32; 2]; 2]> {
         let mut segments = Vec::new();
         for row in 0..self.height.saturating_sub(1) {
@@ -158,12 +158,12 @@ impl DistanceField {
         segments
     }
 
-    /// The samples, at the cells' centres, in the order of the grid's cells [m].
+    /// The samples, at the cells' centres, in the order of the grid's cells \[m\].
     pub fn values(&self) -> &[f32] {
         &self.values
     }
 
-    /// Signed distance at a point of `map` [m]; 0 outside the grid.
+    /// Signed distance at a point of `map` \[m\]; 0 outside the grid.
     pub fn distance(&self, point: [f64; 2]) -> f64 {
         let [u, v] = self
             .grid_from_map
@@ -177,7 +177,7 @@ impl DistanceField {
         self.grid_from_map
     }
 
-    /// Edge of a cell [m].
+    /// Edge of a cell \[m\].
     pub fn resolution(&self) -> f64 {
         self.resolution
     }
@@ -228,7 +228,7 @@ pub fn solidity(grid: &OccupancyGrid) -> Vec<Option<u8>> {
     (0..grid.cells.len()).into_par_iter().map(solid).collect()
 }
 
-/// A point this far behind a wall still counts as a hit of it [m].
+/// A point this far behind a wall still counts as a hit of it \[m\].
 const SHADOW: f64 = 0.1;
 
 /// The unknown cells right behind a wall: those on a straight line from a free cell through occupied ones. Beside the end of
@@ -268,7 +268,7 @@ const THIN: f32 = 2.0;
 /// Walls from this many cells on are filled: their face is their edge.
 const THICK: f32 = 4.0;
 
-/// Moves the field's zero from a thin wall's near face to its middle. Returns the distance moved, for each cell [m].
+/// Moves the field's zero from a thin wall's near face to its middle. Returns the distance moved, for each cell \[m\].
 fn centre_thin_walls(grid: &OccupancyGrid, behind: &[bool], values: &mut [f32]) -> Vec<f32> {
     let resolution = grid.resolution as f32;
     let to_behind = distances(grid, |i| behind[i]);

@@ -64,7 +64,7 @@ impl Faces {
         }
     }
 
-    /// Distance from each cell's centre to the nearest face [cells]. Without a face it exceeds the grid's width.
+    /// Distance from each cell's centre to the nearest face \[cells\]. Without a face it exceeds the grid's width.
     pub(crate) fn distances(&self) -> Vec<f32> {
         let touched = |i: usize| {
             let (column, row) = (i % self.width, i / self.width);

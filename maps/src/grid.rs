@@ -21,7 +21,7 @@ pub struct OccupancyGrid {
     pub width: usize,
     /// Cells along the grid's y axis.
     pub height: usize,
-    /// Edge of a cell [m].
+    /// Edge of a cell \[m\].
     pub resolution: f64,
     /// The lower left corner of cell (0, 0) in `map`; its heading turns the whole grid.
     pub origin: Pose,
@@ -70,7 +70,7 @@ impl OccupancyGrid {
         }
     }
 
-    /// A point of `map` [m] in grid coordinates [cells]: the centre of cell (0, 0) is (0.5, 0.5).
+    /// A point of `map` \[m\] in grid coordinates \[cells\]: the centre of cell (0, 0) is (0.5, 0.5).
     pub fn to_grid(&self, point: [f64; 2]) -> [f64; 2] {
         self.origin
             .inverse()
@@ -78,12 +78,12 @@ impl OccupancyGrid {
             .map(|v| v / self.resolution)
     }
 
-    /// A point in grid coordinates [cells], in `map` [m].
+    /// A point in grid coordinates \[cells\], in `map` \[m\].
     pub fn to_map(&self, point: [f64; 2]) -> [f64; 2] {
         self.origin.transform(point.map(|v| v * self.resolution))
     }
 
-    /// The cell that contains a point of `map` [m]; [`Cell::Unknown`] outside the grid.
+    /// The cell that contains a point of `map` \[m\]; [`Cell::Unknown`] outside the grid.
     pub fn at(&self, point: [f64; 2]) -> Cell {
         let [column, row] = self.to_grid(point);
         self.cell(column.floor() as i64, row.floor() as i64)

@@ -28,15 +28,15 @@ const FREE_THRESH: f64 = 0.196;
 pub struct MapMetadata {
     /// The image's file, relative to the YAML file.
     pub image: String,
-    /// Edge of a pixel [m].
+    /// Edge of a pixel \[m\].
     pub resolution: f64,
-    /// Lower left corner of the image in `map`: x [m], y [m], yaw [rad].
+    /// Lower left corner of the image in `map`: x \[m\], y \[m\], yaw \[rad\].
     pub origin: [f64; 3],
     /// True when white means occupied.
     pub negate: bool,
-    /// Pixels darker than this share of black are occupied, in [0, 1].
+    /// Pixels darker than this share of black are occupied, in \[0, 1\].
     pub occupied_thresh: f64,
-    /// Pixels brighter than this share of black are free, in [0, 1].
+    /// Pixels brighter than this share of black are free, in \[0, 1\].
     pub free_thresh: f64,
     /// How brightness becomes occupancy.
     pub mode: MapMode,
@@ -167,7 +167,7 @@ impl MapMetadata {
         })
     }
 
-    /// Share of a pixel that is wall, in [0, 1]; None where the image says that nobody knows.
+    /// Share of a pixel that is wall, in \[0, 1\]; None where the image says that nobody knows.
     fn occupancy(&self, image: &Raster, index: usize) -> Option<f64> {
         match self.mode {
             MapMode::Raw => {
@@ -305,7 +305,7 @@ fn resolve(file: &str, folder: &Path, image: &str, home: Option<PathBuf>) -> Res
     }
 }
 
-/// An occupancy in [0, 1] as a grey value, 255 all wall.
+/// An occupancy in \[0, 1\] as a grey value, 255 all wall.
 fn grey(occupancy: f64) -> u8 {
     (occupancy * 255.0).round() as u8
 }

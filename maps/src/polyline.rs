@@ -16,9 +16,9 @@ pub(crate) struct PolylineTree {
 pub(crate) struct Nearest {
     /// Segment from vertex `segment` to the next one.
     pub(crate) segment: usize,
-    /// Position on the segment, in [0, 1].
+    /// Position on the segment, in \[0, 1\].
     pub(crate) fraction: f64,
-    /// Squared distance [m^2].
+    /// Squared distance \[m^2\].
     pub(crate) distance_squared: f64,
 }
 
@@ -79,7 +79,7 @@ impl PolylineTree {
     }
 }
 
-/// The point of the segment from `a` to `b` nearest to `point`, as a fraction in [0, 1], and its squared distance.
+/// The point of the segment from `a` to `b` nearest to `point`, as a fraction in \[0, 1\], and its squared distance.
 fn project(a: [f64; 2], b: [f64; 2], point: [f64; 2]) -> (f64, f64) {
     let [dx, dy] = [b[0] - a[0], b[1] - a[1]];
     let [px, py] = [point[0] - a[0], point[1] - a[1]];

@@ -5,7 +5,7 @@ use std::ops::Mul;
 
 use serde::{Deserialize, Serialize};
 
-/// Wraps an angle to `[-pi, pi)` [rad].
+/// Wraps an angle to `[-pi, pi)` \[rad\].
 pub fn wrap_angle(angle: f64) -> f64 {
     if (-PI..PI).contains(&angle) {
         angle
@@ -27,11 +27,11 @@ pub fn wrap_angle(angle: f64) -> f64 {
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Pose {
-    /// Position along the target frame's x axis [m].
+    /// Position along the target frame's x axis \[m\].
     pub x: f64,
-    /// Position along the target frame's y axis [m].
+    /// Position along the target frame's y axis \[m\].
     pub y: f64,
-    /// Direction of the source's x axis in the target frame, in `[-pi, pi)` [rad].
+    /// Direction of the source's x axis in the target frame, in `[-pi, pi)` \[rad\].
     pub heading: f64,
 }
 
@@ -43,7 +43,7 @@ impl Pose {
         heading: 0.0,
     };
 
-    /// A pose at (`x`, `y`) [m] heading `heading` [rad], which is wrapped.
+    /// A pose at (`x`, `y`) \[m\] heading `heading` \[rad\], which is wrapped.
     pub fn new(x: f64, y: f64, heading: f64) -> Self {
         Self {
             x,
@@ -63,7 +63,7 @@ impl Pose {
         )
     }
 
-    /// A point of the source frame, in the target frame [m].
+    /// A point of the source frame, in the target frame \[m\].
     pub fn transform(self, point: [f64; 2]) -> [f64; 2] {
         let (sin, cos) = self.heading.sin_cos();
         [
@@ -78,7 +78,7 @@ impl Pose {
         earlier.inverse() * self
     }
 
-    /// Distance between the two positions [m].
+    /// Distance between the two positions \[m\].
     pub fn distance(self, other: Self) -> f64 {
         (self.x - other.x).hypot(self.y - other.y)
     }
@@ -91,7 +91,7 @@ impl Pose {
     }
 
     /// The pose reached from the identity by the constant twist `[v_x, v_y, omega]` in unit time
-    /// [m, m, rad]: the exponential map of SE(2).
+    /// \[m, m, rad\]: the exponential map of SE(2).
     pub fn exp([vx, vy, omega]: [f64; 3]) -> Self {
         let (s, c) = if omega.abs() < 1e-6 {
             (1.0 - omega * omega / 6.0, omega / 2.0)
@@ -101,7 +101,7 @@ impl Pose {
         Self::new(s * vx - c * vy, c * vx + s * vy, omega)
     }
 
-    /// The twist `[v_x, v_y, omega]` that reaches this pose in unit time [m, m, rad]: the inverse of
+    /// The twist `[v_x, v_y, omega]` that reaches this pose in unit time \[m, m, rad\]: the inverse of
     /// [`Pose::exp`].
     pub fn log(self) -> [f64; 3] {
         let omega = self.heading;

@@ -6,28 +6,28 @@ use crate::wrap_angle;
 /// One point of a raceline.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RacelinePoint {
-    /// Arc length from the start line [m].
+    /// Arc length from the start line \[m\].
     pub s: f64,
-    /// Position in `map` [m].
+    /// Position in `map` \[m\].
     pub x: f64,
-    /// Position in `map` [m].
+    /// Position in `map` \[m\].
     pub y: f64,
-    /// Direction of travel, 0 along x, in `[-pi, pi)` [rad].
+    /// Direction of travel, 0 along x, in `[-pi, pi)` \[rad\].
     pub heading: f64,
-    /// Curvature, left positive [1/m].
+    /// Curvature, left positive \[1/m\].
     pub curvature: f64,
-    /// Speed to drive [m/s].
+    /// Speed to drive \[m/s\].
     pub speed: f64,
 }
 
 /// Position of a point relative to a raceline.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackPosition {
-    /// Arc length of the nearest point of the line, in `[0, length)` [m].
+    /// Arc length of the nearest point of the line, in `[0, length)` \[m\].
     pub s: f64,
-    /// Signed distance from the line, left positive [m].
+    /// Signed distance from the line, left positive \[m\].
     pub d: f64,
-    /// The line's heading there [rad].
+    /// The line's heading there \[rad\].
     pub heading: f64,
 }
 
@@ -48,9 +48,9 @@ pub enum RacelineFault {
     Unordered {
         /// Which point.
         index: usize,
-        /// Its arc length [m].
+        /// Its arc length \[m\].
         s: f64,
-        /// That of the point before [m].
+        /// That of the point before \[m\].
         previous: f64,
     },
     /// A speed is negative.
@@ -58,7 +58,7 @@ pub enum RacelineFault {
     NegativeSpeed {
         /// Which point.
         index: usize,
-        /// Its speed [m/s].
+        /// Its speed \[m/s\].
         speed: f64,
     },
 }
@@ -89,7 +89,7 @@ impl RacelineFault {
 pub struct Raceline {
     /// At least three points, `s` strictly increasing from 0.
     points: Vec<RacelinePoint>,
-    /// Length of a lap, the closing segment included [m].
+    /// Length of a lap, the closing segment included \[m\].
     length: f64,
     vertices: Vec<[f64; 2]>,
     tree: PolylineTree,
@@ -126,7 +126,7 @@ impl Raceline {
         })
     }
 
-    /// A closed line through positions of `map` [m] in order of travel, driven at one `speed` [m/s]. Arc length,
+    /// A closed line through positions of `map` \[m\] in order of travel, driven at one `speed` \[m/s\]. Arc length,
     /// headings and curvatures come from the positions.
     pub fn through(positions: &[[f64; 2]], speed: f64) -> Result<Self, RacelineFault> {
         let geometry = Geometry::of(positions);
@@ -146,12 +146,12 @@ impl Raceline {
         &self.points
     }
 
-    /// Length of a lap [m].
+    /// Length of a lap \[m\].
     pub fn length(&self) -> f64 {
         self.length
     }
 
-    /// The position of `point` of `map` [m] relative to the line: exact at any distance, in about 0.2 us.
+    /// The position of `point` of `map` \[m\] relative to the line: exact at any distance, in about 0.2 us.
     pub fn project(&self, point: [f64; 2]) -> TrackPosition {
         let nearest = self.tree.nearest(&self.vertices, point);
         let (from, to, span) = self.segment(nearest.segment);
@@ -164,7 +164,7 @@ impl Raceline {
         }
     }
 
-    /// The line at arc length `s` [m], interpolated between the points. `s` may lie outside a lap.
+    /// The line at arc length `s` \[m\], interpolated between the points. `s` may lie outside a lap.
     pub fn at(&self, s: f64) -> RacelinePoint {
         let s = self.wrap(s);
         let index = self.points.partition_point(|p| p.s <= s).max(1) - 1;
@@ -181,20 +181,20 @@ impl Raceline {
         }
     }
 
-    /// The same arc length within a lap, in `[0, length)` [m].
+    /// The same arc length within a lap, in `[0, length)` \[m\].
     pub fn wrap(&self, s: f64) -> f64 {
         let wrapped = s.rem_euclid(self.length);
         // A tiny negative `s` rounds up to the length itself.
         if wrapped < self.length { wrapped } else { 0.0 }
     }
 
-    /// The shorter way along the line from arc length `from` to `to`, in `[-length / 2, length / 2)` [m].
+    /// The shorter way along the line from arc length `from` to `to`, in `[-length / 2, length / 2)` \[m\].
     pub fn advance(&self, from: f64, to: f64) -> f64 {
         let half = self.length / 2.0;
         self.wrap(to - from + half) - half
     }
 
-    /// The ends of a segment and the arc length between them [m].
+    /// The ends of a segment and the arc length between them \[m\].
     fn segment(&self, index: usize) -> (&RacelinePoint, &RacelinePoint, f64) {
         let from = &self.points[index];
         match self.points.get(index + 1) {
@@ -235,11 +235,11 @@ fn check(points: &[RacelinePoint]) -> Result<(), RacelineFault> {
 
 /// Arc length, heading and curvature of a closed line, computed from its positions.
 pub(crate) struct Geometry {
-    /// Length of the polyline up to here [m].
+    /// Length of the polyline up to here \[m\].
     pub(crate) s: Vec<f64>,
-    /// Direction of the circle through the neighbours, here [rad].
+    /// Direction of the circle through the neighbours, here \[rad\].
     pub(crate) heading: Vec<f64>,
-    /// Curvature of that circle, left positive [1/m].
+    /// Curvature of that circle, left positive \[1/m\].
     pub(crate) curvature: Vec<f64>,
 }
 

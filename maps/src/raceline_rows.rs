@@ -9,10 +9,10 @@ use std::f64::consts::FRAC_PI_2;
 use crate::raceline::Geometry;
 use crate::{Raceline, RacelineFault, RacelinePoint, wrap_angle};
 
-/// Speed along a line whose file gives none, such as a centre line [m/s].
+/// Speed along a line whose file gives none, such as a centre line \[m/s\].
 const DEFAULT_SPEED: f64 = 2.0;
 
-/// Points nearer to each other than this are one point [m].
+/// Points nearer to each other than this are one point \[m\].
 const SAME_POINT: f64 = 1e-4;
 
 /// A line is open where the gap from its last point to its first is longer than this share of the line, and longer
@@ -25,15 +25,15 @@ const OPEN_SPACINGS: f64 = 3.0;
 pub(crate) struct Row {
     /// Where it stands in the file: a line from 1, or an index from 0.
     pub(crate) place: u64,
-    /// Arc length [m].
+    /// Arc length \[m\].
     pub(crate) s: Option<f64>,
-    /// Position in `map` [m].
+    /// Position in `map` \[m\].
     pub(crate) position: [f64; 2],
-    /// Heading [rad].
+    /// Heading \[rad\].
     pub(crate) psi: Option<f64>,
-    /// Curvature [1/m].
+    /// Curvature \[1/m\].
     pub(crate) kappa: Option<f64>,
-    /// Speed [m/s].
+    /// Speed \[m/s\].
     pub(crate) speed: Option<f64>,
 }
 
@@ -79,7 +79,7 @@ fn drop_restarted_end(rows: &mut Vec<Row>) {
     }
 }
 
-/// The gap from the last point to the first [m], if it is too long to be the end of a lap.
+/// The gap from the last point to the first \[m\], if it is too long to be the end of a lap.
 fn opening(positions: &[[f64; 2]]) -> Option<f64> {
     let (first, last) = (positions.first()?, positions.last()?);
     let gap_to_first = gap(*first, *last);
@@ -140,12 +140,12 @@ fn without_end(positions: &[[f64; 2]]) -> &[[f64; 2]] {
     }
 }
 
-/// Length of the polyline from the first to the last position [m].
+/// Length of the polyline from the first to the last position \[m\].
 fn length(positions: &[[f64; 2]]) -> f64 {
     positions.windows(2).map(|pair| gap(pair[0], pair[1])).sum()
 }
 
-/// Distance between two positions [m].
+/// Distance between two positions \[m\].
 pub(crate) fn gap(from: [f64; 2], to: [f64; 2]) -> f64 {
     (to[0] - from[0]).hypot(to[1] - from[1])
 }

@@ -16,13 +16,13 @@ pub(crate) struct Raster {
 }
 
 impl Raster {
-    /// Mean brightness of the colour channels of pixel `index`, in [0, 1].
+    /// Mean brightness of the colour channels of pixel `index`, in \[0, 1\].
     pub(crate) fn brightness(&self, index: usize) -> f64 {
         let pixel = self.pixel(index);
         self.mean(&pixel[..self.colours()])
     }
 
-    /// Brightness in [0, 1] as `map_server` computes it in trinary mode: a transparent pixel's alpha counts as one
+    /// Brightness in \[0, 1\] as `map_server` computes it in trinary mode: a transparent pixel's alpha counts as one
     /// more colour, and a grey pixel counts as red, green and blue.
     ///
     /// The alpha of an opaque pixel is left out here. `map_server` counts it, and so reads the unknown grey 205 of an

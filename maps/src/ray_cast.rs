@@ -3,7 +3,7 @@
 use crate::{Cell, OccupancyGrid, Pose};
 
 impl OccupancyGrid {
-    /// Range that a laser at `map_from_laser` measures along its x axis [m], to the face of the first occupied cell. Visits
+    /// Range that a laser at `map_from_laser` measures along its x axis \[m\], to the face of the first occupied cell. Visits
     /// every cell on the way (Amanatides and Woo, Eurographics 1987). Unknown cells do not stop the ray. `max_range` if no
     /// wall is nearer; 0 if the laser is not in free space.
     pub fn cast(&self, map_from_laser: Pose, max_range: f64) -> f64 {

@@ -10,7 +10,7 @@ use bincode::config::{Configuration, Fixint, Limit, LittleEndian};
 
 use crate::{Header, HeaderError, Invalid, Message, Stamps, finite};
 
-/// No message is longer than this [bytes].
+/// No message is longer than this \[bytes\].
 const LIMIT: usize = 16 * 1024 * 1024;
 
 const CONFIG: Configuration<LittleEndian, Fixint, Limit<LIMIT>> = bincode::config::standard()
@@ -120,9 +120,9 @@ pub enum CodecError {
     /// Longer than this message may be.
     #[error("a payload of {len} bytes exceeds {max}")]
     TooLong {
-        /// Length [bytes].
+        /// Length \[bytes\].
         len: usize,
-        /// Limit [bytes].
+        /// Limit \[bytes\].
         max: usize,
     },
     /// The payload is cut off or malformed.

@@ -19,9 +19,9 @@ pub struct Stamps {
     pub run_id: u64,
     /// Number of the message within the run and its key, from 1. It is 0 for queries and commands, which are not counted.
     pub sequence: u64,
-    /// The time that the content describes: the sensor's stamp [unix ns].
+    /// The time that the content describes: the sensor's stamp \[unix ns\].
     pub sensor: i64,
-    /// When the message was handed to the network [unix ns].
+    /// When the message was handed to the network \[unix ns\].
     pub published: i64,
 }
 

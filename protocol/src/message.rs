@@ -11,7 +11,7 @@ pub trait Message: Serialize + DeserializeOwned {
     const SCHEMA: Schema;
     /// Version of its layout.
     const VERSION: u16 = 1;
-    /// Longest payload [bytes].
+    /// Longest payload \[bytes\].
     const MAX_LEN: usize = 64 * 1024;
 
     /// Converts a payload of an older version to the present one. None for a version that never existed.

@@ -155,7 +155,7 @@ impl Browser {
         self.ask(&format!("document.body.dispatchEvent({event})")).await;
     }
 
-    /// Presses at one point of the page, moves to another and lets go [px].
+    /// Presses at one point of the page, moves to another and lets go \[px\].
     pub async fn drag(&self, from: [f64; 2], to: [f64; 2]) {
         let move_to = |[x, y]: [f64; 2]| PointerAction::MoveTo {
             duration: Some(Duration::from_millis(50)),

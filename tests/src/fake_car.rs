@@ -263,7 +263,7 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
     }
 }
 
-/// Radius of the line that it drives [m], in a ring of walls a metre to either side.
+/// Radius of the line that it drives \[m\], in a ring of walls a metre to either side.
 const RADIUS: f64 = 3.0;
 
 /// A lap of 2 s, 80 steps of its way.

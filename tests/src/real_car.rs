@@ -9,7 +9,7 @@ use protocol::CarName;
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;
 
-/// Starts it at `start` [m] along the line of `club`; it dials the pit wall at `endpoint`, and keeps in `state` what survives a restart.
+/// Starts it at `start` \[m\] along the line of `club`; it dials the pit wall at `endpoint`, and keeps in `state` what survives a restart.
 pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Path>) -> Node {
     let track = Track::find("club", None).expect("bundled");
     let map = RaceMap {

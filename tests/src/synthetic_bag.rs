@@ -11,11 +11,11 @@ use car_node::ros2::messages::{
 use maps::{Cell, OccupancyGrid, Pose};
 use synpf::Stamp;
 
-/// Edge of a cell [m].
+/// Edge of a cell \[m\].
 const RESOLUTION: f64 = 0.05;
-/// Radius of the drive [m].
+/// Radius of the drive \[m\].
 const RADIUS: f64 = 0.8;
-/// Speed of the drive [m/s].
+/// Speed of the drive \[m/s\].
 const SPEED: f64 = 1.0;
 const BASE_LINK_FROM_LASER: Pose = Pose {
     x: 0.27,
@@ -41,7 +41,7 @@ pub fn room() -> OccupancyGrid {
     OccupancyGrid::new(width, height, RESOLUTION, Pose::IDENTITY, cells)
 }
 
-/// Where the car is at a time after the start [s]: on a circle in the room's left half.
+/// Where the car is at a time after the start \[s\]: on a circle in the room's left half.
 pub fn true_pose(seconds: f64) -> Pose {
     let angle = seconds * SPEED / RADIUS;
     Pose::new(
@@ -137,7 +137,7 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
     bag.finish().expect("a whole file");
 }
 
-/// Range of a beam, by steps of 5 mm: nothing of the code under test [m].
+/// Range of a beam, by steps of 5 mm: nothing of the code under test \[m\].
 fn range(room: &OccupancyGrid, laser: Pose, angle: f64) -> f32 {
     let (sin, cos) = (laser.heading + angle).sin_cos();
     let steps = (0..).map(|step| f64::from(step) * 0.005);

@@ -67,7 +67,7 @@ impl CarProcess {
         Self(child.expect("a car"))
     }
 
-    /// Ends it as a power cut does; tells when [unix ms].
+    /// Ends it as a power cut does; tells when \[unix ms\].
     fn kill(&mut self) -> f64 {
         self.0.kill().expect("killed");
         let now = SystemTime::now().duration_since(UNIX_EPOCH);

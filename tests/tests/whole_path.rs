@@ -104,7 +104,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
     );
 }
 
-/// How far the recorded poses are off the drive, each at the stamp that it claims [m], and how many there are. Every
+/// How far the recorded poses are off the drive, each at the stamp that it claims \[m\], and how many there are. Every
 /// update must be there.
 fn position_rmse(file: &Path) -> (f64, usize) {
     let start = 1_700_000_000_000_000_000_i64;

@@ -14,7 +14,7 @@ use crate::{
     OdometrySensor, Vehicle, VehicleState, Walls, YawSource, outline,
 };
 
-/// Heading error at which a car has spun, and below which it is straight again [rad].
+/// Heading error at which a car has spun, and below which it is straight again \[rad\].
 const SPUN: f64 = FRAC_PI_2;
 const STRAIGHT: f64 = 0.3;
 
@@ -120,7 +120,7 @@ impl Car {
     }
 
     /// Puts the car back to where it did not touch the wall. The speed into the wall is reversed and mostly lost.
-    /// Returns that speed [m/s].
+    /// Returns that speed \[m/s\].
     fn bounce(&mut self, before: &VehicleState, along: [f64; 2]) -> f64 {
         let (sin, cos) = before.heading.sin_cos();
         let velocity = [

@@ -15,7 +15,7 @@ pub struct CarSetup {
     pub driver: DriverParams,
     /// The pose that the driver uses.
     pub guidance: Guidance,
-    /// Start position along the raceline [m]; may be negative.
+    /// Start position along the raceline \[m\]; may be negative.
     pub start: f64,
 }
 

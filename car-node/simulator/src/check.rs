@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use crate::{Track, VehicleParams};
 
-/// Least distance from the raceline to a wall [m]: half a car and 6 cm.
+/// Least distance from the raceline to a wall \[m\]: half a car and 6 cm.
 const CLEARANCE: f64 = 0.20;
 
 /// A track's measures and faults.
@@ -13,27 +13,27 @@ const CLEARANCE: f64 = 0.20;
 pub struct TrackReport {
     /// Its name.
     pub name: String,
-    /// Length of a lap on the raceline [m].
+    /// Length of a lap on the raceline \[m\].
     pub length_m: f64,
-    /// Time for a lap at the raceline's speeds [s].
+    /// Time for a lap at the raceline's speeds \[s\].
     pub lap_time_s: f64,
-    /// Least and greatest speed on the raceline [m/s].
+    /// Least and greatest speed on the raceline \[m/s\].
     pub speed_mps: [f64; 2],
-    /// Least radius of the raceline [m].
+    /// Least radius of the raceline \[m\].
     pub least_radius_m: f64,
-    /// Greatest lateral acceleration on the raceline [m/s^2].
+    /// Greatest lateral acceleration on the raceline \[m/s^2\].
     pub lateral_mps2: f64,
-    /// Least distance from the raceline to a wall [m].
+    /// Least distance from the raceline to a wall \[m\].
     pub clearance_m: f64,
-    /// Least width between the walls, across the raceline [m].
+    /// Least width between the walls, across the raceline \[m\].
     pub width_m: f64,
-    /// Size of the map [m].
+    /// Size of the map \[m\].
     pub map_m: [f64; 2],
-    /// Edge of a map cell [m].
+    /// Edge of a map cell \[m\].
     pub resolution_m: f64,
-    /// Free area of the map [m^2].
+    /// Free area of the map \[m^2\].
     pub free_m2: f64,
-    /// Error of the map's walls, seen from the raceline [m]: mean (positive where the map's walls are further away) and
+    /// Error of the map's walls, seen from the raceline \[m\]: mean (positive where the map's walls are further away) and
     /// standard deviation.
     pub map_error_m: [f64; 2],
     /// Faults that make it unfit for racing; empty if there are none.
@@ -120,7 +120,7 @@ impl TrackReport {
 }
 
 impl Track {
-    /// Time for a lap at the raceline's own speeds [s].
+    /// Time for a lap at the raceline's own speeds \[s\].
     pub fn lap_time(&self) -> f64 {
         let points = self.raceline.points();
         (0..points.len())
@@ -133,7 +133,7 @@ impl Track {
     }
 }
 
-/// Distance to the wall in the map: where the ray enters the first cell that is not free [m].
+/// Distance to the wall in the map: where the ray enters the first cell that is not free \[m\].
 fn drawn(grid: &OccupancyGrid, from: [f64; 2], direction: [f64; 2]) -> Option<f64> {
     let step = grid.resolution / 20.0;
     (0..6000)

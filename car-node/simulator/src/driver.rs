@@ -15,28 +15,28 @@ pub struct DriverParams {
     pub period: Duration,
     /// From a command to the start of its effect (radio, controller, servo). The driver predicts the car over this time.
     pub delay: Duration,
-    /// Look-ahead distance at standstill [m].
+    /// Look-ahead distance at standstill \[m\].
     pub lookahead_base: f64,
-    /// Look-ahead distance per speed [s].
+    /// Look-ahead distance per speed \[s\].
     pub lookahead_gain: f64,
-    /// The line's curvature is read this far ahead in time [s], because servo, tyres and inertia delay the car.
+    /// The line's curvature is read this far ahead in time \[s\], because servo, tyres and inertia delay the car.
     pub steering_lead: f64,
-    /// Steering per difference between the line's yaw rate and the car's [s].
+    /// Steering per difference between the line's yaw rate and the car's \[s\].
     pub yaw_damping: f64,
-    /// Time constant with which the driver learns the offset of the servo's centre [s]. Infinite: it never learns it.
+    /// Time constant with which the driver learns the offset of the servo's centre \[s\]. Infinite: it never learns it.
     pub trim_time: f64,
-    /// Least and most look-ahead [m].
+    /// Least and most look-ahead \[m\].
     pub lookahead_range: [f64; 2],
     /// Speed over the raceline's own.
     pub speed_scale: f64,
-    /// The raceline's speed is read this far ahead in time [s], because the car reacts late.
+    /// The raceline's speed is read this far ahead in time \[s\], because the car reacts late.
     pub speed_lookahead: f64,
-    /// Largest commanded speed above the wheels' speed [m/s]. With the motor controller's gain this is the force that the
+    /// Largest commanded speed above the wheels' speed \[m/s\]. With the motor controller's gain this is the force that the
     /// tyres can transmit; with more, the wheels spin.
     pub traction: f64,
-    /// Share of the speed given up per metre of distance from the line [1/m].
+    /// Share of the speed given up per metre of distance from the line \[1/m\].
     pub error_slowdown: f64,
-    /// Distance to keep from a car ahead, bumper to bumper [m].
+    /// Distance to keep from a car ahead, bumper to bumper \[m\].
     pub gap: f64,
 }
 
@@ -67,18 +67,18 @@ pub struct Estimate {
     pub time: Duration,
     /// `map_from_base_link`.
     pub pose: Pose,
-    /// Forward speed [m/s].
+    /// Forward speed \[m/s\].
     pub speed: f64,
-    /// Yaw rate [rad/s].
+    /// Yaw rate \[rad/s\].
     pub yaw_rate: f64,
 }
 
 /// A car ahead on the line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ahead {
-    /// From bumper to bumper [m].
+    /// From bumper to bumper \[m\].
     pub gap: f64,
-    /// Its speed [m/s].
+    /// Its speed \[m/s\].
     pub speed: f64,
 }
 
@@ -106,27 +106,27 @@ pub struct Driver {
     manoeuvre: Manoeuvre,
     /// Since when the car has not moved although commanded to.
     stuck_since: Option<Duration>,
-    /// Learnt steering angle that drives the car straight [rad].
+    /// Learnt steering angle that drives the car straight \[rad\].
     trim: f64,
 }
 
-/// Beyond this heading error the car is turned round at walking speed [rad].
+/// Beyond this heading error the car is turned round at walking speed \[rad\].
 const LOST_HEADING: f64 = 1.4;
-/// Below this heading error a turning manoeuvre ends [rad].
+/// Below this heading error a turning manoeuvre ends \[rad\].
 const FOUND_HEADING: f64 = 0.7;
-/// Below this speed the tyres hardly slip sideways [m/s].
+/// Below this speed the tyres hardly slip sideways \[m/s\].
 const SLIPPING: f64 = 0.5;
-/// Speed of manoeuvres [m/s].
+/// Speed of manoeuvres \[m/s\].
 const WALKING: f64 = 0.8;
 /// Duration of one leg of a manoeuvre.
 const LEG: Duration = Duration::from_millis(900);
-/// Largest trim [rad].
+/// Largest trim \[rad\].
 const MOST_TRIM: f64 = 0.05;
-/// The trim is learnt within this distance of the line [m]. Larger distances have other causes.
+/// The trim is learnt within this distance of the line \[m\]. Larger distances have other causes.
 const NEAR: f64 = 0.1;
-/// Deceleration behind a car ahead [m/s^2]: what taped tyres can give in a bend.
+/// Deceleration behind a car ahead \[m/s^2\]: what taped tyres can give in a bend.
 pub(crate) const BRAKE_BEHIND: f64 = 2.0;
-/// Extra gap to a car that stands [m]. It falls to zero for one that moves at `SPEED_OF_TRAFFIC` [m/s].
+/// Extra gap to a car that stands \[m\]. It falls to zero for one that moves at `SPEED_OF_TRAFFIC` \[m/s\].
 const BACKING_UP: f64 = 0.8;
 const SPEED_OF_TRAFFIC: f64 = 2.0;
 /// A car that has not moved for this long is stuck.
@@ -231,7 +231,7 @@ impl Driver {
         }
     }
 
-    /// Speed to hold [m/s].
+    /// Speed to hold \[m/s\].
     fn speed(
         &self,
         speed: f64,
@@ -250,7 +250,7 @@ impl Driver {
         ahead.map_or(wanted, |ahead| wanted.min(self.behind(ahead)))
     }
 
-    /// Speed that avoids running into a car ahead [m/s].
+    /// Speed that avoids running into a car ahead \[m/s\].
     fn behind(&self, ahead: Ahead) -> f64 {
         let speed = ahead.speed.max(0.0);
         // A car that stands may have to reverse.
@@ -261,7 +261,7 @@ impl Driver {
         close.min(far).max(0.0)
     }
 
-    /// Direction in which the rear axle moves, relative to a car that drives along the line at `s` [rad]. It is computed
+    /// Direction in which the rear axle moves, relative to a car that drives along the line at `s` \[rad\]. It is computed
     /// from the line: feedback of the measured yaw rate would amplify a yaw oscillation.
     fn sideslip(&self, speed: f64, s: f64, line: &Raceline) -> f64 {
         if speed < SLIPPING {
@@ -273,14 +273,14 @@ impl Driver {
             .sideslip
     }
 
-    /// Acceleration along the line that its speed profile demands [m/s^2].
+    /// Acceleration along the line that its speed profile demands \[m/s^2\].
     fn along(&self, s: f64, line: &Raceline) -> f64 {
         const REACH: f64 = 0.2;
         let gain = line.at(s + REACH).speed.powi(2) - line.at(s - REACH).speed.powi(2);
         gain / (4.0 * REACH) * self.params.speed_scale.powi(2)
     }
 
-    /// Yaw acceleration that the line's curvature demands [rad/s^2].
+    /// Yaw acceleration that the line's curvature demands \[rad/s^2\].
     fn turning_in(&self, s: f64, line: &Raceline) -> f64 {
         const REACH: f64 = 0.3;
         let yaw_rate = |s| {
@@ -291,7 +291,7 @@ impl Driver {
         line.at(s).speed * per_metre * self.params.speed_scale.powi(2)
     }
 
-    /// Steering angle [rad], from the line's curvature and the correction towards the look-ahead point.
+    /// Steering angle \[rad\], from the line's curvature and the correction towards the look-ahead point.
     fn steering(&self, estimate: &Estimate, pose: Pose, sideslip: f64, s: f64, line: &Raceline) -> f64 {
         let p = &self.params;
         let speed = estimate.speed.max(0.5);
@@ -315,14 +315,14 @@ impl Driver {
         turn.steering + self.trim + p.yaw_damping * yaw_error
     }
 
-    /// Distance to the look-ahead point on the line [m].
+    /// Distance to the look-ahead point on the line \[m\].
     fn lookahead(&self, speed: f64) -> f64 {
         let p = &self.params;
         let [least, most] = p.lookahead_range;
         (p.lookahead_base + p.lookahead_gain * speed).clamp(least, most)
     }
 
-    /// Adds a share of the steering that corrects the distance `d` [m] to the trim: integral action (Astrom and Murray,
+    /// Adds a share of the steering that corrects the distance `d` \[m\] to the trim: integral action (Astrom and Murray,
     /// *Feedback Systems*, section 11.1). It integrates `d` rather than the steering, which the tyres limit in bends.
     fn learn_trim(&mut self, speed: f64, d: f64) {
         if speed < SLIPPING || d.abs() > NEAR {
@@ -334,7 +334,7 @@ impl Driver {
     }
 }
 
-/// Curvature of the circle that starts along `from` and goes through a point [1/m].
+/// Curvature of the circle that starts along `from` and goes through a point \[1/m\].
 fn arc_to(from: Pose, point: [f64; 2]) -> f64 {
     let [x, y] = from.inverse().transform(point);
     2.0 * y / (x * x + y * y).max(0.01)

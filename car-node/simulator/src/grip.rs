@@ -2,13 +2,13 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Gravity [m/s^2].
+/// Gravity \[m/s^2\].
 pub(crate) const GRAVITY: f64 = 9.81;
 
 /// Grip, as the paper measures it: the force that slides a standing car sideways.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Grip {
-    /// Force at which a car of 3.5 kg slides sideways [N].
+    /// Force at which a car of 3.5 kg slides sideways \[N\].
     pub lateral_pull: f64,
 }
 

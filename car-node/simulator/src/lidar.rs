@@ -18,24 +18,24 @@ use crate::{Hit, Obstacle, Walls};
 pub struct LidarParams {
     /// Beams in a scan.
     pub beams: usize,
-    /// From the first to the last beam, symmetric about straight ahead [rad].
+    /// From the first to the last beam, symmetric about straight ahead \[rad\].
     pub field_of_view: f64,
     /// From one scan's first beam to the next one's.
     pub period: Duration,
     /// From the first to the last beam of a scan.
     pub sweep: Duration,
-    /// Shortest valid range [m].
+    /// Shortest valid range \[m\].
     pub range_min: f64,
-    /// Longest range [m].
+    /// Longest range \[m\].
     pub range_max: f64,
-    /// Standard deviation of a range [m].
+    /// Standard deviation of a range \[m\].
     pub noise: f64,
-    /// Standard deviation of a beam's direction [rad]. It models the beam's width: grazing beams become noisy and edges
+    /// Standard deviation of a beam's direction \[rad\]. It models the beam's width: grazing beams become noisy and edges
     /// ragged.
     pub jitter: f64,
     /// Share of the beams lost at random.
     pub dropout: f64,
-    /// Returned power (reflectance x cosine of incidence / squared range [1/m^2]) at which half the beams are lost. The
+    /// Returned power (reflectance x cosine of incidence / squared range \[1/m^2\]) at which half the beams are lost. The
     /// data sheet's 30 m on white paper is 0.001.
     pub half_power: f64,
     /// Pose of the scanner on the car.
@@ -87,17 +87,17 @@ impl LidarParams {
 pub struct Scan {
     /// When the first beam was measured, since the start of the race.
     pub stamp: Duration,
-    /// Direction of the first beam in the laser's frame [rad].
+    /// Direction of the first beam in the laser's frame \[rad\].
     pub angle_min: f64,
-    /// From one beam to the next [rad].
+    /// From one beam to the next \[rad\].
     pub angle_increment: f64,
-    /// From one beam to the next [s].
+    /// From one beam to the next \[s\].
     pub time_increment: f64,
-    /// Shortest valid range [m].
+    /// Shortest valid range \[m\].
     pub range_min: f64,
-    /// Longest valid range [m].
+    /// Longest valid range \[m\].
     pub range_max: f64,
-    /// A range for each beam [m]; infinite where there was no return.
+    /// A range for each beam \[m\]; infinite where there was no return.
     pub ranges: Vec<f32>,
 }
 
@@ -214,7 +214,7 @@ mod tests {
         Walls::new(vec![Wall { surface, points }])
     }
 
-    /// The first scan of a laser at the middle of the room that moves at `speed` [m/s] along x.
+    /// The first scan of a laser at the middle of the room that moves at `speed` \[m/s\] along x.
     fn scan(params: LidarParams, walls: &Walls, others: &[Obstacle], speed: f64) -> Scan {
         let mut lidar = Lidar::new(params, Duration::ZERO, StdRng::seed_from_u64(1));
         let mount = params.base_link_from_laser.inverse();

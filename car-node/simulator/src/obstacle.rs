@@ -9,7 +9,7 @@ use crate::{Hit, Surface, Vehicle};
 pub struct Obstacle {
     /// The middle of the rectangle.
     pub map_from_centre: Pose,
-    /// Half its length and half its width [m].
+    /// Half its length and half its width \[m\].
     pub half: [f64; 2],
 }
 
@@ -55,7 +55,7 @@ impl Obstacle {
 }
 
 /// How two rectangles overlap, by the separating axis theorem: the unit vector along which the second must move to
-/// part from the first, and how far [m]. None where they do not overlap.
+/// part from the first, and how far \[m\]. None where they do not overlap.
 pub(crate) fn overlap(boxes: &[Obstacle; 2]) -> Option<([f64; 2], f64)> {
     let [a, b] = boxes.map(|o| o.map_from_centre);
     let between = [b.x - a.x, b.y - a.y];

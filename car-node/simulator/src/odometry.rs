@@ -29,15 +29,15 @@ pub struct OdometryParams {
     pub yaw_source: YawSource,
     /// Relative error of the speed calibration: tyres wear, and grow with speed.
     pub speed_scale: f64,
-    /// Standard deviation of a speed reading [m/s].
+    /// Standard deviation of a speed reading \[m/s\].
     pub speed_noise: f64,
     /// From one gyroscope message to the next.
     pub gyro_period: Duration,
-    /// Bias of the gyroscope at the start: standard deviation [rad/s].
+    /// Bias of the gyroscope at the start: standard deviation \[rad/s\].
     pub gyro_bias: f64,
-    /// Random walk of the bias [rad/s per square root of a second].
+    /// Random walk of the bias \[rad/s per square root of a second\].
     pub gyro_walk: f64,
-    /// Standard deviation of a yaw-rate reading [rad/s].
+    /// Standard deviation of a yaw-rate reading \[rad/s\].
     pub gyro_noise: f64,
     /// Relative error of the gyroscope's scale.
     pub gyro_scale: f64,
@@ -68,9 +68,9 @@ pub struct Odometry {
     pub stamp: Duration,
     /// `odom_from_base_link`.
     pub pose: Pose,
-    /// Speed of the wheels [m/s].
+    /// Speed of the wheels \[m/s\].
     pub speed: f64,
-    /// Yaw rate [rad/s].
+    /// Yaw rate \[rad/s\].
     pub yaw_rate: f64,
 }
 
@@ -79,18 +79,18 @@ pub struct Odometry {
 pub struct Gyro {
     /// Time of the measurement, since the start of the race.
     pub stamp: Duration,
-    /// Yaw rate, left positive [rad/s].
+    /// Yaw rate, left positive \[rad/s\].
     pub yaw_rate: f64,
 }
 
 /// The true motion that both sensors measure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Motion {
-    /// Speed of the wheels' circumference [m/s].
+    /// Speed of the wheels' circumference \[m/s\].
     pub wheel_speed: f64,
-    /// True yaw rate [rad/s].
+    /// True yaw rate \[rad/s\].
     pub yaw_rate: f64,
-    /// Commanded steering angle [rad].
+    /// Commanded steering angle \[rad\].
     pub steering: f64,
 }
 
@@ -108,7 +108,7 @@ pub struct OdometrySensor {
 }
 
 impl OdometrySensor {
-    /// The gyroscope's latest reading [rad/s].
+    /// The gyroscope's latest reading \[rad/s\].
     pub fn gyro_yaw_rate(&self) -> f64 {
         self.latest_gyro
     }

@@ -49,9 +49,9 @@ pub struct Truth {
     pub stamp: Duration,
     /// `map_from_base_link`.
     pub pose: Pose,
-    /// Velocity of `base_link` in its own frame: forwards [m/s], to the left [m/s], yaw rate [rad/s].
+    /// Velocity of `base_link` in its own frame: forwards \[m/s\], to the left \[m/s\], yaw rate \[rad/s\].
     pub twist: [f64; 3],
-    /// Speed of the wheels' circumference [m/s].
+    /// Speed of the wheels' circumference \[m/s\].
     pub wheel_speed: f64,
     /// Position relative to the raceline.
     pub track: TrackPosition,
@@ -73,6 +73,6 @@ pub struct Lap {
 pub struct Contact {
     /// Where the car was: `map_from_base_link`.
     pub pose: Pose,
-    /// Speed into what was touched [m/s].
+    /// Speed into what was touched \[m/s\].
     pub impact: f64,
 }

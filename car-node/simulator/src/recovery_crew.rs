@@ -10,10 +10,10 @@ use crate::driver::BRAKE_BEHIND;
 /// From a crash until the crew is ready to put the car back.
 pub(crate) const RECOVERY_TIME: Duration = Duration::from_secs(3);
 
-/// The crew looks this far back along the line for a free place [m], in steps of `LOOK_STEP` [m].
+/// The crew looks this far back along the line for a free place \[m\], in steps of `LOOK_STEP` \[m\].
 const LOOK_BACK: f64 = 5.0;
 const LOOK_STEP: f64 = 0.25;
-/// Room that a car needs before and behind it [m].
+/// Room that a car needs before and behind it \[m\].
 const ROOM: f64 = 0.3;
 /// After waiting this long for a free place, the crew puts the car where it left the line.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(10);
@@ -26,7 +26,7 @@ pub(crate) fn place_for(cars: &[Car], index: usize, line: &Raceline, now: Durati
     Some(Pose::new(point.x, point.y, point.heading))
 }
 
-/// The place as arc length [m]. Never behind the start line: the car would cross it twice.
+/// The place as arc length \[m\]. Never behind the start line: the car would cross it twice.
 fn arc_length_for(cars: &[Car], index: usize, line: &Raceline, now: Duration) -> Option<f64> {
     let car = &cars[index];
     let ready = car.recovery_ready.filter(|ready| now >= *ready)?;

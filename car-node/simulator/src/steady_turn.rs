@@ -9,16 +9,16 @@ const USABLE: f64 = 0.82;
 /// Steering and sideslip of a turn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Turn {
-    /// Steering angle [rad].
+    /// Steering angle \[rad\].
     pub steering: f64,
-    /// Direction in which the rear axle moves, seen from the car [rad]. The tail slides outwards, so the nose points
+    /// Direction in which the rear axle moves, seen from the car \[rad\]. The tail slides outwards, so the nose points
     /// into the turn.
     pub sideslip: f64,
 }
 
 impl VehicleParams {
-    /// Steering and sideslip at `speed` [m/s] for a `lateral` acceleration [m/s^2], an acceleration `along` the car [m/s^2]
-    /// and a `yaw_acceleration` [rad/s^2]. Computed from the tyres' whole curve. A demand beyond the grip is cut to a
+    /// Steering and sideslip at `speed` \[m/s\] for a `lateral` acceleration \[m/s^2\], an acceleration `along` the car \[m/s^2\]
+    /// and a `yaw_acceleration` \[rad/s^2\]. Computed from the tyres' whole curve. A demand beyond the grip is cut to a
     /// share of the tyres' peak force. This is the look-up table of MAP (Becker, Imholz et al., ICRA 2023), computed on
     /// demand.
     pub fn turn(&self, speed: f64, lateral: f64, along: f64, yaw_acceleration: f64) -> Turn {

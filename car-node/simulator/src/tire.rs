@@ -15,16 +15,16 @@ pub struct TireParams {
     pub curvature: f64,
     /// Friction coefficient at the peak and at `nominal_load`: factor D over the load.
     pub friction: f64,
-    /// Load at which `friction` holds [N].
+    /// Load at which `friction` holds \[N\].
     pub nominal_load: f64,
     /// Share of friction lost when the load doubles.
     pub load_sensitivity: f64,
-    /// Distance rolled until 63 % of a step in slip has become force [m].
+    /// Distance rolled until 63 % of a step in slip has become force \[m\].
     pub relaxation_length: f64,
 }
 
 impl TireParams {
-    /// Force on the car [N], longitudinal and lateral, for a load [N] and the slip vector (dimensionless, pointing
+    /// Force on the car \[N\], longitudinal and lateral, for a load \[N\] and the slip vector (dimensionless, pointing
     /// where the tread pushes the car).
     pub fn force(&self, load: f64, slip: [f64; 2]) -> [f64; 2] {
         let magnitude = slip[0].hypot(slip[1]);
@@ -35,14 +35,14 @@ impl TireParams {
         slip.map(|component| component * force)
     }
 
-    /// Greatest force at a load [N].
+    /// Greatest force at a load \[N\].
     pub fn peak(&self, load: f64) -> f64 {
         let overload = load / self.nominal_load - 1.0;
         // A tyre far beyond its nominal load keeps some grip.
         self.friction * (1.0 - self.load_sensitivity * overload).max(0.3) * load
     }
 
-    /// Force per slip at small slip [N].
+    /// Force per slip at small slip \[N\].
     pub fn linear_stiffness(&self, load: f64) -> f64 {
         self.peak(load) * self.stiffness * self.shape
     }
@@ -62,7 +62,7 @@ impl TireParams {
         f64::midpoint(low, high)
     }
 
-    /// The signed slip below the peak that makes `force` [N] at `load` [N]. For a force beyond the peak, the slip of the
+    /// The signed slip below the peak that makes `force` \[N\] at `load` \[N\]. For a force beyond the peak, the slip of the
     /// peak.
     pub fn slip_for(&self, load: f64, force: f64) -> f64 {
         let share = (force / self.peak(load)).abs();
@@ -78,7 +78,7 @@ impl TireParams {
         f64::midpoint(low, high).copysign(force)
     }
 
-    /// The magic formula over its peak: in [-1, 1].
+    /// The magic formula over its peak: in \[-1, 1\].
     fn normalised(&self, slip: f64) -> f64 {
         let steep = self.stiffness * slip;
         (self.shape * (steep - self.curvature * (steep - steep.atan())).atan()).sin()

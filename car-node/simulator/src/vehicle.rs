@@ -5,20 +5,20 @@ use maps::Pose;
 use crate::grip::{GRAVITY, Grip};
 use crate::{TireParams, VehicleParams, VehicleState};
 
-/// Step of the integration [s]. The drive line and the tyres oscillate at about 100 rad/s; with this step the error of a
+/// Step of the integration \[s\]. The drive line and the tyres oscillate at about 100 rad/s; with this step the error of a
 /// Runge-Kutta step stays far below a micrometre.
 const STEP: f64 = 0.001_25;
 
-/// Below this rolling speed a tyre's slip is damped as at this speed [m/s]. At rest the slip would otherwise be a spring
+/// Below this rolling speed a tyre's slip is damped as at this speed \[m/s\]. At rest the slip would otherwise be a spring
 /// without a damper (Pacejka, section 8.6).
 const LOW_SPEED: f64 = 0.5;
 
 /// The driver's command.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Controls {
-    /// Set point of the wheel speed [m/s].
+    /// Set point of the wheel speed \[m/s\].
     pub speed: f64,
-    /// Set point of the steering angle, left positive [rad].
+    /// Set point of the steering angle, left positive \[rad\].
     pub steering: f64,
 }
 
@@ -77,20 +77,20 @@ impl Vehicle {
         centre * Pose::new(-self.params.rear_axle, 0.0, 0.0)
     }
 
-    /// Velocity of `base_link` in its own frame: forwards [m/s], to the left [m/s], yaw rate [rad/s].
+    /// Velocity of `base_link` in its own frame: forwards \[m/s\], to the left \[m/s\], yaw rate \[rad/s\].
     pub fn twist(&self) -> [f64; 3] {
         let s = &self.state;
         [s.vx, s.vy - self.params.rear_axle * s.yaw_rate, s.yaw_rate]
     }
 
-    /// Velocity of the centre of gravity in `map` [m/s].
+    /// Velocity of the centre of gravity in `map` \[m/s\].
     pub fn velocity(&self) -> [f64; 2] {
         let s = &self.state;
         let (sin, cos) = s.heading.sin_cos();
         [s.vx * cos - s.vy * sin, s.vx * sin + s.vy * cos]
     }
 
-    /// Moves the car by an offset [m] and changes its velocity [m/s], both in `map`.
+    /// Moves the car by an offset \[m\] and changes its velocity \[m/s\], both in `map`.
     pub(crate) fn push(&mut self, offset: [f64; 2], velocity: [f64; 2]) {
         let s = &mut self.state;
         let (sin, cos) = s.heading.sin_cos();
@@ -99,7 +99,7 @@ impl Vehicle {
         s.vy += velocity[1] * cos - velocity[0] * sin;
     }
 
-    /// Integrates over `duration` [s], rounded to whole steps of 1.25 ms, at least one.
+    /// Integrates over `duration` \[s\], rounded to whole steps of 1.25 ms, at least one.
     pub fn drive(&mut self, controls: Controls, duration: f64) {
         let steps = (duration / STEP).round().max(1.0) as usize;
         for _ in 0..steps {
@@ -164,7 +164,7 @@ impl Vehicle {
         }
     }
 
-    /// Loads of the axles under a longitudinal acceleration [N].
+    /// Loads of the axles under a longitudinal acceleration \[N\].
     fn loads(&self, acceleration: f64) -> [f64; 2] {
         let p = &self.params;
         let [front, rear] = p.static_loads();
@@ -172,7 +172,7 @@ impl Vehicle {
         [front - shift, rear + shift]
     }
 
-    /// The motor controller's force at the tyres [N]: proportional to the error, within current and power.
+    /// The motor controller's force at the tyres \[N\]: proportional to the error, within current and power.
     fn motor_force(&self, wheel_speed: f64, command: f64) -> f64 {
         let p = &self.params;
         let wanted = p.speed_gain * (command - wheel_speed);

@@ -17,47 +17,47 @@ use crate::grip::{GRAVITY, Grip};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VehicleParams {
-    /// Mass [kg].
+    /// Mass \[kg\].
     pub mass: f64,
-    /// Moment of inertia about the vertical axis [kg m^2].
+    /// Moment of inertia about the vertical axis \[kg m^2\].
     pub yaw_inertia: f64,
-    /// From the centre of gravity forward to the front axle [m].
+    /// From the centre of gravity forward to the front axle \[m\].
     pub front_axle: f64,
-    /// From the centre of gravity back to the rear axle, which is `base_link` [m].
+    /// From the centre of gravity back to the rear axle, which is `base_link` \[m\].
     pub rear_axle: f64,
-    /// Height of the centre of gravity [m].
+    /// Height of the centre of gravity \[m\].
     pub cg_height: f64,
     /// Both front tyres.
     pub front_tires: TireParams,
     /// Both rear tyres.
     pub rear_tires: TireParams,
-    /// Rolling radius of a wheel [m].
+    /// Rolling radius of a wheel \[m\].
     pub wheel_radius: f64,
-    /// Inertia of wheels, shafts and rotor, reduced to the wheels [kg m^2].
+    /// Inertia of wheels, shafts and rotor, reduced to the wheels \[kg m^2\].
     pub driveline_inertia: f64,
-    /// Greatest driving force at the tyres, from the current limit [N].
+    /// Greatest driving force at the tyres, from the current limit \[N\].
     pub max_drive_force: f64,
-    /// Greatest braking force at the tyres, from the regenerative current limit [N].
+    /// Greatest braking force at the tyres, from the regenerative current limit \[N\].
     pub max_brake_force: f64,
-    /// Greatest mechanical power at the wheels [W].
+    /// Greatest mechanical power at the wheels \[W\].
     pub max_power: f64,
-    /// Force of the motor controller per error of wheel speed [N/(m/s)].
+    /// Force of the motor controller per error of wheel speed \[N/(m/s)\].
     pub speed_gain: f64,
     /// Rolling resistance over weight.
     pub rolling_resistance: f64,
-    /// Air drag over squared speed [N/(m/s)^2].
+    /// Air drag over squared speed \[N/(m/s)^2\].
     pub drag: f64,
-    /// Largest steering angle, either way [rad].
+    /// Largest steering angle, either way \[rad\].
     pub max_steering: f64,
-    /// Fastest change of the steering angle [rad/s].
+    /// Fastest change of the steering angle \[rad/s\].
     pub steering_rate: f64,
-    /// Error of the servo's centre, left positive [rad]. Real cars are trimmed by eye.
+    /// Error of the servo's centre, left positive \[rad\]. Real cars are trimmed by eye.
     pub steering_offset: f64,
-    /// The servo's control gain [1/s].
+    /// The servo's control gain \[1/s\].
     pub steering_gain: f64,
-    /// Length and width of the body [m].
+    /// Length and width of the body \[m\].
     pub body: [f64; 2],
-    /// From the rear axle back to the rear bumper [m].
+    /// From the rear axle back to the rear bumper \[m\].
     pub rear_overhang: f64,
 }
 
@@ -102,7 +102,7 @@ impl Default for VehicleParams {
 }
 
 impl VehicleParams {
-    /// Distance between the axles [m].
+    /// Distance between the axles \[m\].
     pub fn wheelbase(&self) -> f64 {
         self.front_axle + self.rear_axle
     }
@@ -115,7 +115,7 @@ impl VehicleParams {
         self
     }
 
-    /// Understeer gradient K [s^2/m]. At small lateral acceleration the yaw rate is
+    /// Understeer gradient K \[s^2/m\]. At small lateral acceleration the yaw rate is
     /// `v delta / (wheelbase + K v^2)` (Rajamani, *Vehicle Dynamics and Control*, section 3.3).
     pub fn understeer_gradient(&self) -> f64 {
         let [front, rear] = self.static_loads();
@@ -124,14 +124,14 @@ impl VehicleParams {
         self.mass / self.wheelbase() * (self.rear_axle / front_stiffness - self.front_axle / rear_stiffness)
     }
 
-    /// Loads of the front and the rear axle at rest [N].
+    /// Loads of the front and the rear axle at rest \[N\].
     pub fn static_loads(&self) -> [f64; 2] {
         let weight = self.mass * GRAVITY / self.wheelbase();
         [weight * self.rear_axle, weight * self.front_axle]
     }
 }
 
-/// The car's outline at a pose of `base_link`: its corners in `map`, counter-clockwise [m].
+/// The car's outline at a pose of `base_link`: its corners in `map`, counter-clockwise \[m\].
 pub fn outline(params: &VehicleParams, map_from_base_link: Pose) -> [[f64; 2]; 4] {
     let (back, half) = (-params.rear_overhang, params.body[1] / 2.0);
     let front = back + params.body[0];

@@ -3,27 +3,27 @@
 /// Position, velocity, wheel speed, tyre slip, pitch and steering.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct VehicleState {
-    /// Position of the centre of gravity in `map` [m].
+    /// Position of the centre of gravity in `map` \[m\].
     pub x: f64,
-    /// Position of the centre of gravity in `map` [m].
+    /// Position of the centre of gravity in `map` \[m\].
     pub y: f64,
-    /// Heading, not wrapped [rad].
+    /// Heading, not wrapped \[rad\].
     pub heading: f64,
-    /// Speed of the centre of gravity, forwards [m/s].
+    /// Speed of the centre of gravity, forwards \[m/s\].
     pub vx: f64,
-    /// Speed of the centre of gravity, to the left [m/s].
+    /// Speed of the centre of gravity, to the left \[m/s\].
     pub vy: f64,
-    /// Yaw rate, left positive [rad/s].
+    /// Yaw rate, left positive \[rad/s\].
     pub yaw_rate: f64,
-    /// Speed of the wheels' circumference [m/s].
+    /// Speed of the wheels' circumference \[m/s\].
     pub wheel_speed: f64,
     /// Slip of the front tyres, longitudinal and lateral, delayed by their relaxation length.
     pub front_slip: [f64; 2],
     /// Slip of the rear tyres, likewise.
     pub rear_slip: [f64; 2],
-    /// Longitudinal acceleration, delayed by the springs [m/s^2]. It shifts load between the axles.
+    /// Longitudinal acceleration, delayed by the springs \[m/s^2\]. It shifts load between the axles.
     pub pitch_acceleration: f64,
-    /// Steering angle of the front wheels [rad].
+    /// Steering angle of the front wheels \[rad\].
     pub steering: f64,
 }
 

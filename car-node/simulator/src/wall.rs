@@ -13,7 +13,7 @@ pub enum Surface {
 }
 
 impl Surface {
-    /// Diffuse reflectance at the laser's 905 nm, in [0, 1].
+    /// Diffuse reflectance at the laser's 905 nm, in \[0, 1\].
     pub fn reflectance(self) -> f64 {
         match self {
             Self::Plain => 0.7,
@@ -27,16 +27,16 @@ impl Surface {
 pub struct Wall {
     /// Its surface.
     pub surface: Surface,
-    /// Vertices in `map` [m]; repeat the first one to close it.
+    /// Vertices in `map` \[m\]; repeat the first one to close it.
     pub points: Vec<[f64; 2]>,
 }
 
 /// Where a ray meets a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hit {
-    /// Distance along the ray [m].
+    /// Distance along the ray \[m\].
     pub range: f64,
-    /// Cosine of the angle between the ray and the surface's normal, in [0, 1].
+    /// Cosine of the angle between the ray and the surface's normal, in \[0, 1\].
     pub incidence: f64,
     /// The surface hit.
     pub surface: Surface,

@@ -6,7 +6,7 @@ use maps::MapError;
 
 use crate::{Surface, Wall, Walls};
 
-/// Walls lie within this distance of the first point, along x and along y: the index is a table over all of them [m].
+/// Walls lie within this distance of the first point, along x and along y: the index is a table over all of them \[m\].
 const MOST: f64 = 500.0;
 
 impl Walls {

@@ -5,7 +5,7 @@ use maps::OccupancyGrid;
 use crate::contour::contours;
 use crate::{Hit, Surface, Wall};
 
-/// Edge of a cell of the index [m].
+/// Edge of a cell of the index \[m\].
 const CELL: f64 = 0.5;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,7 +20,7 @@ struct Segment {
 pub struct Walls {
     polylines: Vec<Wall>,
     segments: Vec<Segment>,
-    /// Lower left corner of the index [m].
+    /// Lower left corner of the index \[m\].
     corner: [f64; 2],
     columns: usize,
     rows: usize,
@@ -99,7 +99,7 @@ impl Walls {
         &self.polylines
     }
 
-    /// The first wall that a ray from `origin` [m] along the unit vector `direction` meets within `max_range` [m].
+    /// The first wall that a ray from `origin` \[m\] along the unit vector `direction` meets within `max_range` \[m\].
     pub fn cast(&self, origin: [f64; 2], direction: [f64; 2], max_range: f64) -> Option<Hit> {
         let mut best: Option<(f64, u32)> = None;
         let mut limit = max_range;
@@ -147,7 +147,7 @@ impl Walls {
         })
     }
 
-    /// Calls `visit` with each index cell's segments along a ray, and where the ray leaves the cell [m], until it
+    /// Calls `visit` with each index cell's segments along a ray, and where the ray leaves the cell \[m\], until it
     /// returns false (Amanatides and Woo, *A Fast Voxel Traversal Algorithm*, 1987).
     fn along_ray(
         &self,
@@ -209,7 +209,7 @@ fn passes(s: &Segment, centre: [f64; 2]) -> bool {
     offset.abs() <= (dx.abs() + dy.abs()) * (CELL / 2.0 + 1e-9)
 }
 
-/// Where a ray meets a segment [m].
+/// Where a ray meets a segment \[m\].
 fn meet(s: &Segment, origin: [f64; 2], direction: [f64; 2]) -> Option<f64> {
     let [ax, ay] = s.along;
     let [ox, oy] = [s.from[0] - origin[0], s.from[1] - origin[1]];

@@ -16,10 +16,10 @@ use crate::{
 /// Ticks from one truth message to the next: 100 Hz.
 const TRUTH_EVERY: u64 = 4;
 
-/// A car that hits a wall faster than this stops and waits for the recovery crew [m/s]. A slower one scrapes along.
+/// A car that hits a wall faster than this stops and waits for the recovery crew \[m/s\]. A slower one scrapes along.
 const CRASH_SPEED: f64 = 1.0;
 
-/// A driver reacts to cars ahead within this distance [m]: enough to stop from full speed behind one that stands.
+/// A driver reacts to cars ahead within this distance \[m\]: enough to stop from full speed behind one that stands.
 const IN_VIEW: f64 = 16.0;
 
 /// A race in progress. [`World::step`] moves it on; it has no other clock.
@@ -99,7 +99,7 @@ impl World {
         self.cars[car].vehicle.set_grip(grip);
     }
 
-    /// Knocks a car round: adds to its yaw rate [rad/s].
+    /// Knocks a car round: adds to its yaw rate \[rad/s\].
     pub fn knock(&mut self, car: usize, yaw_rate: f64) {
         self.cars[car].vehicle.state_mut().yaw_rate += yaw_rate;
     }

@@ -22,7 +22,7 @@ pub struct Command {
 }
 
 impl Command {
-    /// Longest name of an operator [bytes].
+    /// Longest name of an operator \[bytes\].
     pub const MAX_OPERATOR: usize = 64;
 }
 
@@ -63,14 +63,14 @@ pub enum ParamsAction {
     Select {
         /// Its name.
         name: String,
-        /// Fall back by itself after this time unless confirmed [ms].
+        /// Fall back by itself after this time unless confirmed \[ms\].
         revert_after_ms: Option<u32>,
     },
     /// Store a set on the car and put it in force. It replaces a stored set of the same name.
     Put {
         /// The set. Values that are not given are taken from the set in force.
         set: ParameterSet,
-        /// Fall back by itself after this time unless confirmed [ms].
+        /// Fall back by itself after this time unless confirmed \[ms\].
         revert_after_ms: Option<u32>,
     },
     /// Keep the set in force: do not fall back.
@@ -117,20 +117,20 @@ pub enum RatesAction {
 /// The rates of a car's telemetry.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Rates {
-    /// Most poses per second [Hz]; 0 for none, 1000 for every pose.
+    /// Most poses per second \[Hz\]; 0 for none, 1000 for every pose.
     pub pose: f32,
-    /// Clouds per second [Hz].
+    /// Clouds per second \[Hz\].
     pub cloud: f32,
-    /// Scan views per second [Hz].
+    /// Scan views per second \[Hz\].
     pub scan: f32,
-    /// Health messages per second [Hz], in addition to one on each change of state.
+    /// Health messages per second \[Hz\], in addition to one on each change of state.
     pub health: f32,
     /// Send the full-rate streams for the recorder.
     pub recorded: bool,
 }
 
 impl Rates {
-    /// Highest rate that can be set [Hz].
+    /// Highest rate that can be set \[Hz\].
     pub const MAX: f32 = 1000.0;
 }
 

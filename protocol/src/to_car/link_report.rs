@@ -7,9 +7,9 @@ use crate::{Message, Schema};
 /// Sent once a second, so that the car can send less while its link is slow.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LinkReport {
-    /// Time from publishing a pose to its arrival: median of the last second, corrected by the clocks' offset [s].
+    /// Time from publishing a pose to its arrival: median of the last second, corrected by the clocks' offset \[s\].
     pub transit: f32,
-    /// Largest error of `transit`, from the uncertainty of the clocks' offset [s].
+    /// Largest error of `transit`, from the uncertainty of the clocks' offset \[s\].
     pub uncertainty: f32,
     /// Poses that arrived in that second.
     pub poses: u32,

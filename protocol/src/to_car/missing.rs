@@ -20,14 +20,14 @@ pub struct MissingRequest {
     pub run_id: u64,
     /// The missing numbers, the most urgent stream first, at most [`MissingRequest::MAX_STREAMS`].
     pub streams: Vec<Wanted>,
-    /// Total length of the messages in the reply [bytes]. One message is sent even if it is longer.
+    /// Total length of the messages in the reply \[bytes\]. One message is sent even if it is longer.
     pub budget: u32,
 }
 
 impl MissingRequest {
     /// Most streams in one request.
     pub const MAX_STREAMS: usize = 16;
-    /// Largest budget that a car accepts [bytes].
+    /// Largest budget that a car accepts \[bytes\].
     pub const MAX_BUDGET: u32 = 64 * 1024;
 }
 

@@ -15,13 +15,13 @@ pub struct Cloud {
     pub count: u32,
     /// Effective sample size over `count`, before resampling, in `[0, 1]`.
     pub ess_ratio: f32,
-    /// Standard deviation along the car's heading [m].
+    /// Standard deviation along the car's heading \[m\].
     pub spread_along: f32,
-    /// Standard deviation across the car's heading [m].
+    /// Standard deviation across the car's heading \[m\].
     pub spread_across: f32,
     /// Mass of the second cluster over that of the first, in `[0, 1]`.
     pub second_mode: f32,
-    /// The point that particle positions are relative to [m].
+    /// The point that particle positions are relative to \[m\].
     pub centre: [f64; 2],
     /// The sample: at most [`Cloud::MAX_PARTICLES`], drawn by weight or evenly.
     pub particles: Vec<CloudParticle>,
@@ -55,9 +55,9 @@ pub struct CloudParticle {
 }
 
 impl CloudParticle {
-    /// Step of a position [m]. It reaches 327 m to either side of the centre.
+    /// Step of a position \[m\]. It reaches 327 m to either side of the centre.
     pub const METRES: f64 = 0.01;
-    /// Step of a heading [rad].
+    /// Step of a heading \[rad\].
     pub const RADIANS: f64 = PI / 32768.0;
 
     /// Rounds a particle. `weight` is relative to the heaviest one, in `[0, 1]`. Positions out of range become the

@@ -78,7 +78,7 @@ pub enum EventKind {
         to: SetRef,
         /// The first filter update under it.
         update: u64,
-        /// The car falls back by itself after this time unless the set is confirmed [s].
+        /// The car falls back by itself after this time unless the set is confirmed \[s\].
         revert_after: Option<f32>,
     },
     /// The set in force was confirmed: the car will not fall back by itself.
@@ -128,7 +128,7 @@ pub enum EventKind {
     Lap {
         /// The lap that ended, from 1.
         lap: u32,
-        /// Its time [s]; None for the first crossing, which ends no whole lap.
+        /// Its time \[s\]; None for the first crossing, which ends no whole lap.
         time: Option<f64>,
         /// The set in force at its end.
         set: String,
@@ -142,7 +142,7 @@ pub enum EventKind {
     SlipEnded {
         /// The worst in between, see [`Metrics::slip`](crate::Metrics::slip).
         worst: f32,
-        /// How long it lasted [s].
+        /// How long it lasted \[s\].
         duration: f32,
     },
     /// The car proposes another set.
@@ -200,9 +200,9 @@ pub enum EventKind {
     },
     /// The link is slow: the car sends less than requested.
     RatesLowered {
-        /// From publishing a pose to its arrival [s].
+        /// From publishing a pose to its arrival \[s\].
         transit: f32,
-        /// Poses per second now [Hz].
+        /// Poses per second now \[Hz\].
         pose: f32,
         /// True while the full-rate streams for the recorder go on. Otherwise the car keeps them and sends them when the link
         /// allows.

@@ -12,7 +12,7 @@ use crate::{CodecError, Invalid, Message, Schema};
 pub struct Health {
     /// The state.
     pub state: State,
-    /// When this state was entered [unix ns].
+    /// When this state was entered \[unix ns\].
     pub since: i64,
     /// The causes, the worst first. Empty when all is well. At most [`Health::MAX_CAUSES`].
     pub causes: Vec<Cause>,
@@ -202,7 +202,7 @@ pub enum Severity {
 pub struct Metrics {
     /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in `[0, 1]`.
     pub alignment: f32,
-    /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
+    /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
     pub residual: f32,
     /// Share of the valid beams more than 0.3 m shorter than in the map, in `[0, 1]`.
     pub short_beams: f32,
@@ -214,23 +214,23 @@ pub struct Metrics {
     pub ess_ratio: f32,
     /// Short-term over long-term average of how well the scan fits the map at the estimate; 1 when all is as usual.
     pub w_ratio: f32,
-    /// Standard deviation of the particles along the track [m].
+    /// Standard deviation of the particles along the track \[m\].
     pub spread_along: f32,
-    /// Standard deviation of the particles across the track [m].
+    /// Standard deviation of the particles across the track \[m\].
     pub spread_across: f32,
     /// Mass of the second cluster of particles over that of the first, in `[0, 1]`.
     pub second_mode: f32,
     /// Share of odometry's distance that was not driven. Positive when the wheels spin, negative when they lock.
     pub slip: f32,
-    /// Odometry's yaw rate less the posterior's [rad/s].
+    /// Odometry's yaw rate less the posterior's \[rad/s\].
     pub yaw_rate_residual: f32,
-    /// Distance by which the last scan corrected the pose [m].
+    /// Distance by which the last scan corrected the pose \[m\].
     pub innovation: f32,
-    /// Angle by which the last scan corrected the pose [rad].
+    /// Angle by which the last scan corrected the pose \[rad\].
     pub innovation_angle: f32,
-    /// Age of a pose when it was published: median over the last second [s].
+    /// Age of a pose when it was published: median over the last second \[s\].
     pub age_p50: f32,
-    /// Age of a pose when it was published: 99th percentile over the last second [s].
+    /// Age of a pose when it was published: 99th percentile over the last second \[s\].
     pub age_p99: f32,
     /// Particles in use.
     pub particles: u32,
@@ -243,7 +243,7 @@ pub struct Proposal {
     pub set: String,
     /// The reason, with numbers.
     pub evidence: String,
-    /// Since when [unix ns].
+    /// Since when \[unix ns\].
     pub since: i64,
 }
 

@@ -15,7 +15,7 @@ pub struct CarInfo {
     pub source: String,
     /// Name of the map.
     pub map: String,
-    /// Length of a lap of the raceline [m]; None without a raceline.
+    /// Length of a lap of the raceline \[m\]; None without a raceline.
     pub lap_length: Option<f64>,
     /// Pose of the laser on the car.
     pub base_link_from_laser: Pose2,
@@ -31,7 +31,7 @@ impl Message for CarInfo {
 /// Asks for the time of the car's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ClockRequest {
-    /// When the query was sent [ns, the sender's clock].
+    /// When the query was sent \[ns, the sender's clock\].
     pub sent: i64,
 }
 
@@ -46,14 +46,14 @@ impl Message for ClockRequest {
 pub struct ClockReply {
     /// [`ClockRequest::sent`], returned.
     pub sent: i64,
-    /// When the query arrived [unix ns, the car's clock].
+    /// When the query arrived \[unix ns, the car's clock\].
     pub received: i64,
-    /// When this reply was made [unix ns, the car's clock].
+    /// When this reply was made \[unix ns, the car's clock\].
     pub answered: i64,
 }
 
 impl ClockReply {
-    /// The offset of the car's clock from that of the query's sender, and the round-trip time [ns, ns]. The error of the
+    /// The offset of the car's clock from that of the query's sender, and the round-trip time \[ns, ns\]. The error of the
     /// offset is at most half the round-trip time. `arrived` is when the reply arrived, by the sender's clock.
     pub fn offset_and_round_trip(&self, arrived: i64) -> (i64, i64) {
         let there = i128::from(self.received) - i128::from(self.sent);

@@ -11,21 +11,21 @@ pub struct Load {
     pub cpu_process: f32,
     /// Use of each core, in `[0, 1]`. At most [`Load::MAX_CORES`].
     pub cpu_cores: Vec<f32>,
-    /// Memory of this process [bytes].
+    /// Memory of this process \[bytes\].
     pub memory_process: u64,
-    /// Memory in use on the machine [bytes].
+    /// Memory in use on the machine \[bytes\].
     pub memory_used: u64,
-    /// Memory of the machine [bytes].
+    /// Memory of the machine \[bytes\].
     pub memory_total: u64,
-    /// Temperature of the machine's hottest sensor [deg C]; None where there is no sensor.
+    /// Temperature of the machine's hottest sensor \[deg C\]; None where there is no sensor.
     pub temperature: Option<f32>,
     /// True while the machine slows down for heat or lack of power; None where that is not known.
     pub throttled: Option<bool>,
-    /// Time of a whole filter update, from the scan to the estimate [us].
+    /// Time of a whole filter update, from the scan to the estimate \[us\].
     pub update_us: Latency,
-    /// Age of a scan when it reached the filter [us].
+    /// Age of a scan when it reached the filter \[us\].
     pub scan_age_us: Latency,
-    /// Time from a pose leaving the filter until the network has accepted it [us].
+    /// Time from a pose leaving the filter until the network has accepted it \[us\].
     pub publish_lag_us: Latency,
     /// Scans per second.
     pub scan_rate: f32,
@@ -33,7 +33,7 @@ pub struct Load {
     pub odometry_rate: f32,
     /// Filter updates per second.
     pub update_rate: f32,
-    /// Standard deviation of the time between scans [s].
+    /// Standard deviation of the time between scans \[s\].
     pub scan_jitter: f32,
     /// Messages waiting for the filter.
     pub queue_depth: u32,
@@ -46,14 +46,14 @@ impl Load {
     pub const MAX_CORES: usize = 256;
 }
 
-/// Spread of a duration [us].
+/// Spread of a duration \[us\].
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Latency {
-    /// Median [us].
+    /// Median \[us\].
     pub p50: f32,
-    /// 99th percentile [us].
+    /// 99th percentile \[us\].
     pub p99: f32,
-    /// Maximum [us].
+    /// Maximum \[us\].
     pub max: f32,
 }
 

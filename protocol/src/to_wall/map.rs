@@ -13,7 +13,7 @@ pub struct MapReply {
     pub width: u32,
     /// Cells along y.
     pub height: u32,
-    /// Edge of a cell [m].
+    /// Edge of a cell \[m\].
     pub resolution: f64,
     /// The lower left corner of the grid in `map`.
     pub origin: Pose2,
@@ -26,9 +26,9 @@ pub struct MapReply {
 /// A closed raceline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MapRaceline {
-    /// Length of a lap [m].
+    /// Length of a lap \[m\].
     pub length: f64,
-    /// Points `[x, y]` in order of travel [m].
+    /// Points `[x, y]` in order of travel \[m\].
     pub points: Vec<[f32; 2]>,
 }
 

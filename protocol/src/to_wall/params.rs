@@ -15,7 +15,7 @@ pub struct Params {
     pub revision: u64,
     /// Who put it in force: an operator's name, `start` or `auto`.
     pub who: String,
-    /// When [unix ns].
+    /// When \[unix ns\].
     pub when: i64,
     /// The first filter update under it.
     pub since_update: u64,
@@ -30,7 +30,7 @@ pub struct Params {
 pub struct PendingRevert {
     /// The set that it falls back to.
     pub to: String,
-    /// When [unix ns, the car's clock].
+    /// When \[unix ns, the car's clock\].
     pub at: i64,
 }
 
@@ -44,7 +44,7 @@ pub struct ParameterSet {
 }
 
 impl ParameterSet {
-    /// Longest name of a set [bytes].
+    /// Longest name of a set \[bytes\].
     pub const MAX_NAME: usize = 64;
     /// Most values in a set.
     pub const MAX_VALUES: usize = 256;

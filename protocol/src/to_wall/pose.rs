@@ -26,9 +26,9 @@ pub struct Pose {
 /// A position relative to a raceline.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TrackPoint {
-    /// Arc length of the nearest point of the line [m].
+    /// Arc length of the nearest point of the line \[m\].
     pub s: f64,
-    /// Signed distance from the line, left positive [m].
+    /// Signed distance from the line, left positive \[m\].
     pub d: f64,
 }
 

@@ -21,17 +21,17 @@ impl Message for RecordedOdometry {
 /// One scan as the filter received it. Its first beam was measured at the header's sensor time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordedScan {
-    /// Direction of the first beam in the laser's frame [rad].
+    /// Direction of the first beam in the laser's frame \[rad\].
     pub angle_min: f64,
-    /// Angle from one beam to the next, signed [rad].
+    /// Angle from one beam to the next, signed \[rad\].
     pub angle_increment: f64,
-    /// Time from one beam to the next; 0 when the whole scan has one time [s].
+    /// Time from one beam to the next; 0 when the whole scan has one time \[s\].
     pub time_increment: f64,
-    /// Shortest valid reading [m].
+    /// Shortest valid reading \[m\].
     pub range_min: f64,
-    /// Readings from here on mean that nothing is in range [m].
+    /// Readings from here on mean that nothing is in range \[m\].
     pub range_max: f64,
-    /// One reading per beam [mm], [`RecordedScan::NO_RETURN`] where there was none; at most
+    /// One reading per beam \[mm\], [`RecordedScan::NO_RETURN`] where there was none; at most
     /// [`RecordedScan::MAX_BEAMS`].
     pub ranges: Vec<u16>,
 }
@@ -42,7 +42,7 @@ impl RecordedScan {
     /// Marks a reading that is NaN, infinite, negative or beyond 65.534 m.
     pub const NO_RETURN: u16 = u16::MAX;
 
-    /// A reading [m] in millimetres.
+    /// A reading \[m\] in millimetres.
     pub fn quantise(range: f32) -> u16 {
         let millimetres = (range * 1000.0).round();
         if (0.0..f32::from(Self::NO_RETURN)).contains(&millimetres) {

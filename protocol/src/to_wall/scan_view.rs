@@ -9,7 +9,7 @@ use crate::{Invalid, Message, Schema};
 pub struct ScanView {
     /// The filter update that it belongs to.
     pub update: u64,
-    /// The point of `map` that the end points are relative to [m].
+    /// The point of `map` that the end points are relative to \[m\].
     pub centre: [f64; 2],
     /// At most [`ScanView::MAX_POINTS`], in the order of the beams.
     pub points: Vec<EndPoint>,
@@ -19,7 +19,7 @@ impl ScanView {
     /// Most points in one message.
     pub const MAX_POINTS: usize = 128;
 
-    /// An end point in `map` [m].
+    /// An end point in `map` \[m\].
     pub fn point(&self, point: EndPoint) -> [f64; 2] {
         [
             self.centre[0] + f64::from(point.x) * EndPoint::METRES,
@@ -40,10 +40,10 @@ pub struct EndPoint {
 }
 
 impl EndPoint {
-    /// Step of a position [m].
+    /// Step of a position \[m\].
     pub const METRES: f64 = 0.01;
 
-    /// Rounds an end point in `map` [m]. Positions out of range become the outermost ones.
+    /// Rounds an end point in `map` \[m\]. Positions out of range become the outermost ones.
     pub fn quantise(point: [f64; 2], centre: [f64; 2], kind: EndPointKind) -> Self {
         Self {
             x: ((point[0] - centre[0]) / Self::METRES).round() as i16,

@@ -13,7 +13,7 @@ pub struct Shadow {
     pub set: Option<String>,
     /// Who started or ended it: an operator's name, `start`, or `load` where the car ended it for lack of CPU.
     pub who: String,
-    /// Since when [unix ns].
+    /// Since when \[unix ns\].
     pub since: i64,
     /// Comparison over the last seconds. None without a shadow set, and until both sets have processed the same scans.
     pub comparison: Option<Comparison>,
@@ -25,7 +25,7 @@ pub struct Shadow {
 pub struct Comparison {
     /// The set in force.
     pub in_force: SetRef,
-    /// Time that it covers [s].
+    /// Time that it covers \[s\].
     pub window: f32,
     /// Scans that both sets have processed.
     pub scans: u32,
@@ -35,11 +35,11 @@ pub struct Comparison {
     pub force: Fitness,
     /// Metrics of the shadow set over these scans.
     pub shadow: Fitness,
-    /// Mean distance between the two poses [m].
+    /// Mean distance between the two poses \[m\].
     pub distance: f32,
-    /// Greatest distance between the two poses [m].
+    /// Greatest distance between the two poses \[m\].
     pub distance_max: f32,
-    /// Mean angle between the two headings [rad].
+    /// Mean angle between the two headings \[rad\].
     pub angle: f32,
     /// Share of the scans that fit better under the set in force, in `[0, 1]`.
     pub force_better: f32,
@@ -48,7 +48,7 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// Residuals that differ by less than this count as equal [m].
+    /// Residuals that differ by less than this count as equal \[m\].
     pub const MARGIN: f64 = 0.002;
 }
 
@@ -57,13 +57,13 @@ impl Comparison {
 pub struct Fitness {
     /// See [`Metrics::alignment`](crate::Metrics::alignment), in `[0, 1]`.
     pub alignment: f32,
-    /// See [`Metrics::residual`](crate::Metrics::residual) [m].
+    /// See [`Metrics::residual`](crate::Metrics::residual) \[m\].
     pub residual: f32,
-    /// Distance by which a scan corrected the pose [m].
+    /// Distance by which a scan corrected the pose \[m\].
     pub innovation: f32,
-    /// Standard deviation of the particles along the track [m].
+    /// Standard deviation of the particles along the track \[m\].
     pub spread_along: f32,
-    /// Standard deviation of the particles across the track [m].
+    /// Standard deviation of the particles across the track \[m\].
     pub spread_across: f32,
     /// Time of a whole update.
     pub update_us: Latency,

@@ -164,7 +164,7 @@ fn wait_for(address: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// CPU time that a process has used [s].
+/// CPU time that a process has used \[s\].
 fn cpu_seconds(pid: u32) -> anyhow::Result<f64> {
     /// Linux counts in hundredths of a second, whatever the kernel's own tick.
     const TICKS: f64 = 100.0;
@@ -185,7 +185,7 @@ fn cpu_seconds(pid: u32) -> anyhow::Result<f64> {
     Ok((ticks(11)? + ticks(12)?) / TICKS)
 }
 
-/// A number of /proc/PID/status [kB].
+/// A number of /proc/PID/status \[kB\].
 fn status(pid: u32, name: &str) -> anyhow::Result<f64> {
     let text = std::fs::read_to_string(format!("/proc/{pid}/status")).context("the pit wall has ended")?;
     text.lines()

@@ -32,7 +32,7 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// A car that starts at `start` [m] along the raceline.
+/// A car that starts at `start` \[m\] along the raceline.
 fn race(name: &str, start: f64, endpoint: &str, state: Option<&Path>) -> anyhow::Result<()> {
     let node = start_real(&CarName::new(name)?, start, endpoint, state);
     std::thread::sleep(LONGEST);

@@ -9,7 +9,7 @@ use super::spline::{curve_and_knots, distance, normals};
 use super::{LineError, TrackSpec, draw_map, minimum_curvature, speed_profile};
 use crate::{Surface, Track, Wall, Walls};
 
-/// Distance between the points of the centre line [m].
+/// Distance between the points of the centre line \[m\].
 const SPACING: f64 = 0.05;
 
 impl TrackSpec {

@@ -15,17 +15,17 @@ use crate::{LidarParams, Walls};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MappingParams {
-    /// Edge of a cell [m].
+    /// Edge of a cell \[m\].
     pub resolution: f64,
-    /// Standard deviation of the mapping run's position error after closing the loop [m].
+    /// Standard deviation of the mapping run's position error after closing the loop \[m\].
     pub drift: f64,
-    /// Standard deviation of its heading error [rad].
+    /// Standard deviation of its heading error \[rad\].
     pub heading_drift: f64,
     /// Least share of beams that end in an occupied cell, of all beams that end in it or pass it. One half is the most
     /// likely map (Hahnel et al., 2003). `gmapping` uses 0.25, Karto and `slam_toolbox` 0.1: they draw every cell that
     /// noise reaches, so their walls stand about 3 cm too close.
     pub occupied_share: f64,
-    /// Distance between the poses of the scans [m].
+    /// Distance between the poses of the scans \[m\].
     pub step: f64,
 }
 
@@ -41,9 +41,9 @@ impl Default for MappingParams {
     }
 }
 
-/// Longer beams are not used, as in common mappers [m].
+/// Longer beams are not used, as in common mappers \[m\].
 const REACH: f64 = 12.0;
-/// Free border around the walls [m].
+/// Free border around the walls \[m\].
 const BORDER: f64 = 0.5;
 
 /// Maps the walls from one slow drive along `path` with a noisy laser. Counts for every cell the beams that end in it and
@@ -114,7 +114,7 @@ pub fn draw_map(path: &[[f64; 2]], walls: &Walls, params: &MappingParams, seed: 
     OccupancyGrid::new(width, height, params.resolution, origin, cells)
 }
 
-/// Range of one beam of the mapping run [m]; None without a return.
+/// Range of one beam of the mapping run \[m\]; None without a return.
 fn measure(rng: &mut StdRng, lidar: &LidarParams, pose: Pose, angle: f64, walls: &Walls) -> Option<f64> {
     let jitter: f64 = StandardNormal.sample(rng);
     let noise: f64 = StandardNormal.sample(rng);
@@ -156,7 +156,7 @@ fn enter(
     }
 }
 
-/// Bounding box of walls and path [m].
+/// Bounding box of walls and path \[m\].
 fn extent(walls: &Walls, path: &[[f64; 2]]) -> ([f64; 2], [f64; 2]) {
     let points = walls.polylines().iter().flat_map(|wall| &wall.points).chain(path);
     points.fold(([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]), |(low, high), p| {

@@ -6,13 +6,13 @@ use super::ring::Ring;
 use super::spline::{normals, resample};
 use crate::Walls;
 
-/// Distance between the points that are optimised [m].
+/// Distance between the points that are optimised \[m\].
 const SPACING: f64 = 0.25;
-/// Distance between the points of the finished line [m].
+/// Distance between the points of the finished line \[m\].
 const FINE: f64 = 0.1;
 /// Rounds of optimising and resampling. More rounds change millimetres.
 const ROUNDS: usize = 6;
-/// Walls further away than this are ignored [m].
+/// Walls further away than this are ignored \[m\].
 const REACH: f64 = 5.0;
 
 /// Why no raceline was found.
@@ -23,13 +23,13 @@ pub enum LineError {
         "at ({x:.2}, {y:.2}) m only {room:.2} m lie between the walls, and the margins need {needed:.2} m"
     )]
     TooNarrow {
-        /// Where [m].
+        /// Where \[m\].
         x: f64,
-        /// Where [m].
+        /// Where \[m\].
         y: f64,
-        /// Width there [m].
+        /// Width there \[m\].
         room: f64,
-        /// Twice the margin [m].
+        /// Twice the margin \[m\].
         needed: f64,
     },
     /// The points make no closed line.
@@ -37,7 +37,7 @@ pub enum LineError {
     Line(#[from] RacelineFault),
 }
 
-/// The closed line of least squared curvature that keeps `margin` [m] from all walls, found from a line between them. Its
+/// The closed line of least squared curvature that keeps `margin` \[m\] from all walls, found from a line between them. Its
 /// speed is 1 m/s.
 ///
 /// Heilmeier et al., *Minimum curvature trajectory planning and control for an autonomous race car*, 2019: each point
@@ -58,7 +58,7 @@ pub fn minimum_curvature(start: &[[f64; 2]], walls: &Walls, margin: f64) -> Resu
     Ok(Raceline::through(&curve, 1.0)?)
 }
 
-/// How far each point may move along its normal: to the right (negative) and to the left [m].
+/// How far each point may move along its normal: to the right (negative) and to the left \[m\].
 fn room(
     points: &[[f64; 2]],
     normals: &[[f64; 2]],

@@ -10,11 +10,11 @@ use super::{MappingParams, SpeedParams, TrackSpec};
 
 /// Most tries to find a random line with room for a track.
 const TRIES: u64 = 1000;
-/// Distance between the points at which a line is checked [m].
+/// Distance between the points at which a line is checked \[m\].
 const SPACING: f64 = 0.25;
 
 impl TrackSpec {
-    /// A random track: about `length` [m] a lap, `width` [m] wide.
+    /// A random track: about `length` \[m\] a lap, `width` \[m\] wide.
     ///
     /// The centre line winds around a ring. Lines that bend too sharply for their width or come too close to themselves are
     /// rejected. Long and narrow tracks wind more.

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 use super::spline::distance;
 use super::{MappingParams, SpeedParams};
 
-/// Least distance between control points [m].
+/// Least distance between control points \[m\].
 const CLOSEST: f64 = 0.1;
-/// Longest lap, measured along the control points [m]. Club tracks reach 540 m.
+/// Longest lap, measured along the control points \[m\]. Club tracks reach 540 m.
 const LONGEST: f64 = 600.0;
 
 /// The description of a track. The same description makes the same track.
@@ -19,17 +19,17 @@ pub struct TrackSpec {
     pub name: String,
     /// Decides everything that is random: wall texture, posts, map noise.
     pub seed: u64,
-    /// Control points of the closed centre line, in order of travel [m].
+    /// Control points of the closed centre line, in order of travel \[m\].
     pub centre: Vec<[f64; 2]>,
     /// True when the second half of the lap is the first, turned by 180 degrees about the origin; `centre` then gives the
     /// first half only.
     #[serde(default)]
     pub point_symmetric: bool,
-    /// From the centre line to either wall, at each control point [m]. One value counts for all.
+    /// From the centre line to either wall, at each control point \[m\]. One value counts for all.
     pub half_width: Vec<f64>,
-    /// From the raceline to any wall [m]: half a car and the driver's error.
+    /// From the raceline to any wall \[m\]: half a car and the driver's error.
     pub margin: f64,
-    /// Amplitude of the walls' waves [m]; 0 makes them featureless.
+    /// Amplitude of the walls' waves \[m\]; 0 makes them featureless.
     #[serde(default)]
     pub texture: f64,
     /// Posts along the walls, boxes of 0.2 m to 0.4 m that stand half in the track: number per 10 m of wall.
@@ -53,9 +53,9 @@ pub struct TrackSpec {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BlackStretch {
-    /// Where it begins, in [0, 1].
+    /// Where it begins, in \[0, 1\].
     pub from: f64,
-    /// Where it ends, in [0, 1], after `from`.
+    /// Where it ends, in \[0, 1\], after `from`.
     pub to: f64,
     /// On the left wall, else on the right one.
     pub left: bool,
@@ -65,11 +65,11 @@ pub struct BlackStretch {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Block {
-    /// Its middle [m].
+    /// Its middle \[m\].
     pub at: [f64; 2],
-    /// Length of its sides [m].
+    /// Length of its sides \[m\].
     pub size: [f64; 2],
-    /// Direction of the first side [rad].
+    /// Direction of the first side \[rad\].
     #[serde(default)]
     pub heading: f64,
 }

@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SpeedParams {
-    /// Lateral acceleration [m/s^2].
+    /// Lateral acceleration \[m/s^2\].
     pub lateral: f64,
-    /// Acceleration on the straight [m/s^2].
+    /// Acceleration on the straight \[m/s^2\].
     pub drive: f64,
-    /// Deceleration on the straight [m/s^2].
+    /// Deceleration on the straight \[m/s^2\].
     pub brake: f64,
-    /// Top speed [m/s].
+    /// Top speed \[m/s\].
     pub top: f64,
 }
 
@@ -74,7 +74,7 @@ fn fastest(line: &Raceline, params: &SpeedParams, most: impl Fn(&RacelinePoint) 
     Raceline::new(points).expect("the same line with other speeds")
 }
 
-/// Time of a lap at the line's own speeds [s].
+/// Time of a lap at the line's own speeds \[s\].
 #[cfg(test)]
 fn lap_time(line: &Raceline) -> f64 {
     let points = line.points();

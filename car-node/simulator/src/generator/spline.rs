@@ -7,7 +7,7 @@ use super::ring::Ring;
 /// Points between two control points before resampling.
 const STEPS: usize = 100;
 
-/// A closed Catmull-Rom curve through control points, resampled to points about `spacing` [m] apart. The centripetal form
+/// A closed Catmull-Rom curve through control points, resampled to points about `spacing` \[m\] apart. The centripetal form
 /// has no cusps and no loops (Yuksel et al., 2011).
 pub(crate) fn closed_curve(control: &[[f64; 2]], spacing: f64) -> Vec<[f64; 2]> {
     curve_and_knots(control, spacing).0
@@ -35,7 +35,7 @@ pub(crate) fn curve_and_knots(control: &[[f64; 2]], spacing: f64) -> (Vec<[f64; 
     (curve, knots)
 }
 
-/// A closed polyline resampled at equal distances of about `spacing` [m], with at least as many points as a [`Ring`]
+/// A closed polyline resampled at equal distances of about `spacing` \[m\], with at least as many points as a [`Ring`]
 /// needs.
 pub(crate) fn resample(points: &[[f64; 2]], spacing: f64) -> Vec<[f64; 2]> {
     let n = points.len();

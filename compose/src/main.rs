@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Parser;
-use pitwall::{PageOptions, PitWall, Role, WallOptions};
+use pitwall::{PageOptions, PitWallOptions, PitWallServer, Role};
 
 /// Three simulated cars race; a pit wall watches.
 #[derive(Debug, Parser)]
@@ -33,7 +33,7 @@ struct Options {
     #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = show::duration)]
     time: Option<Duration>,
     /// Where the pit wall listens for cars.
-    #[arg(long, value_name = "ENDPOINT", default_value = pitwall::LOCAL_WALL)]
+    #[arg(long, value_name = "ENDPOINT", default_value = pitwall::LOCAL_PITWALL)]
     listen: String,
     /// Where the pit wall's page is served.
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = PageOptions::default().address)]
@@ -65,8 +65,8 @@ fn run(options: &Options) -> anyhow::Result<()> {
         .worker_threads(2)
         .enable_all()
         .build()?;
-    let wall = runtime
-        .block_on(PitWall::start(WallOptions {
+    let pitwall = runtime
+        .block_on(PitWallServer::start(PitWallOptions {
             role: Role::Router {
                 listen: vec![options.listen.clone()],
                 discoverable: false,
@@ -81,10 +81,10 @@ fn run(options: &Options) -> anyhow::Result<()> {
         )?;
     let radio = runtime.block_on(radio::start(&options.listen))?;
     let nodes = cars::start(options, &radio)?;
-    let shown = show::banner(options, wall.url())
-        .and_then(|()| runtime.block_on(show::until_the_end(wall.hub(), options.time, options.json)));
+    let shown = show::banner(options, pitwall.url())
+        .and_then(|()| runtime.block_on(show::until_the_end(pitwall.service(), options.time, options.json)));
     cars::shutdown(nodes);
-    runtime.block_on(wall.stop());
+    runtime.block_on(pitwall.stop());
     // Nobody reads on: the demo ends quietly.
     match shown {
         Err(error) if show::is_closed_pipe(&error) => Ok(()),

@@ -4,7 +4,7 @@
 use std::io::{self, ErrorKind, Write};
 use std::time::Duration;
 
-use pitwall::{CarView, Hub, unix_now};
+use pitwall::{CarView, FleetService, unix_now};
 use protocol::Severity;
 
 use crate::Options;
@@ -94,7 +94,11 @@ pub(crate) fn complain(error: &anyhow::Error) {
 }
 
 /// Shows what happens until the time is over or somebody presses Ctrl-C.
-pub(crate) async fn until_the_end(hub: &Hub, time: Option<Duration>, json: bool) -> anyhow::Result<()> {
+pub(crate) async fn until_the_end(
+    service: &FleetService,
+    time: Option<Duration>,
+    json: bool,
+) -> anyhow::Result<()> {
     let over = async {
         match time {
             Some(time) => tokio::time::sleep(time).await,
@@ -102,19 +106,19 @@ pub(crate) async fn until_the_end(hub: &Hub, time: Option<Duration>, json: bool)
         }
     };
     tokio::select! {
-        result = show(hub, json) => result,
+        result = show(service, json) => result,
         () = over => Ok(()),
         result = tokio::signal::ctrl_c() => Ok(result?),
     }
 }
 
-async fn show(hub: &Hub, json: bool) -> anyhow::Result<()> {
+async fn show(service: &FleetService, json: bool) -> anyhow::Result<()> {
     let mut ticks = tokio::time::interval(TICK);
     let (mut seen, mut list_due) = (0, tokio::time::Instant::now() + LIST);
     loop {
         ticks.tick().await;
         let (cars, news) = {
-            let fleet = hub.fleet();
+            let fleet = service.fleet();
             let news: Vec<_> = fleet.log().since(seen).cloned().collect();
             seen = fleet.log().last();
             (fleet.view(unix_now()), news)

@@ -8,14 +8,14 @@ use clap::{Args, Parser, Subcommand};
 use pitwall::Replay;
 use protocol::{CarName, Pose2, Rates};
 
-use crate::link::endpoint;
+use crate::network::endpoint;
 
 /// The pit wall: how well every car is localized and why. Without a command it serves the page.
 #[derive(Debug, Parser)]
 #[command(version, after_help = EXIT_CODES)]
 pub(crate) struct Cli {
     #[command(flatten)]
-    pub(crate) link: LinkOptions,
+    pub(crate) network: NetworkOptions,
     /// Write JSON on stdout instead of text.
     #[arg(long, global = true, help_heading = GLOBAL)]
     pub(crate) json: bool,
@@ -57,7 +57,7 @@ none does, this program listens for the cars itself, on tcp/0.0.0.0:7447, while 
 Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict.";
 
 #[derive(Debug, Args)]
-pub(crate) struct LinkOptions {
+pub(crate) struct NetworkOptions {
     /// Listen for cars here, as tcp/ADDRESS:PORT; may be given several times.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) listen: Vec<String>,
@@ -69,7 +69,7 @@ pub(crate) struct LinkOptions {
     operator: Option<String>,
 }
 
-impl LinkOptions {
+impl NetworkOptions {
     /// Who gives commands.
     pub(crate) fn operator(&self) -> String {
         let user = || std::env::var("USER").ok().filter(|user| !user.is_empty());

@@ -1,61 +1,55 @@
 //! The pit wall: how well every car is localized and why, on one laptop.
 //!
 //! ```text
-//! cars ==zenoh==> link -> FleetEvent -> Fleet (pure state) -> page, terminal, JSON
-//!                              '------> recorder (one MCAP file per session)
+//! cars ==zenoh==> network -> FleetEvent -> Fleet (pure state) -> page, terminal, JSON
+//!                                '-------> recording (one MCAP file per session)
 //! ```
 //!
-//! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Link`] is the
+//! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Connection`] is the
 //! only way to the network.
 
-// The terminal's verbs name the library as anybody else would.
+// The commands name the library as any other program would.
 extern crate self as pitwall;
 
-mod ask;
-mod board;
-mod car;
-mod catch_up;
 mod cli;
+mod clock;
 mod commands;
 mod event;
+mod event_bus;
 mod fleet;
-mod gaps;
-mod history;
-mod hub;
-mod laps;
-mod link;
-mod log;
+mod fleet_service;
+mod network;
 mod output;
 mod program;
 mod recording;
 mod replay;
 mod report;
 #[cfg(feature = "rerun")]
-mod rerun_view;
-mod stream;
-mod wall;
+mod rerun;
+mod server;
+mod terminal;
 mod web;
 
-pub use ask::{PATIENCE, Verdict, new_command_id};
-pub use board::{Board, FleetGuard};
-pub use car::{Car, CarView, PoseView, SetView};
-pub use event::{FleetEvent, Happening, Lane, Sent};
-pub use fleet::Fleet;
-pub use gaps::{Arrival, GapSummary, Gaps};
-pub use history::{Moment, Place};
-pub use hub::{Hub, StartError};
-pub use laps::{Lap, LapGrip, SECTORS};
-pub use link::{DEFAULT_LISTEN, LOCAL_WALL, Link, LinkError, Role, Sink, unix_now};
-pub use log::{Log, LogEntry};
+#[cfg(feature = "rerun")]
+pub use crate::rerun::{RerunError, RerunOutlet, RerunView};
+pub use clock::unix_now;
+pub use event::{Delivery, EventPayload, EventSink, FleetEvent, SentRange};
+pub use event_bus::{EventBus, FleetGuard};
+pub use fleet::{
+    Car, CarView, Fleet, GapSummary, HealthSample, Lap, LapGrip, Log, LogEntry, PoseView, ProfileCell,
+    SECTORS, SequenceStatus, SequenceTracker, SetView, StreamStatistics, StreamView,
+};
+pub use fleet_service::{FleetService, StartRecordingError};
+pub use network::{
+    Client, Connection, ConnectionError, DEFAULT_LISTEN, LOCAL_PITWALL, REPLY_TIMEOUT, Role, Verdict,
+    new_command_id,
+};
 pub use program::program;
 pub use recording::{
-    Progress, Recorder, Recording, RecordingError, Recovered, Status, StreamSummary, Summary, Unreadable,
-    UnreadableCount, read_events, recover,
+    Recorder, RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered,
+    StreamSummary, Unreadable, UnreadableCount, read_events, recover,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{CarReport, MeanSigma, Report, TableRow, TrueError};
-#[cfg(feature = "rerun")]
-pub use rerun_view::{RerunError, RerunOutlet, RerunView};
-pub use stream::{Stream, StreamView};
-pub use wall::{PitWall, WallError, WallOptions};
+pub use server::{PitWallError, PitWallOptions, PitWallServer};
 pub use web::{Page, PageOptions};

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use tracing_subscriber::EnvFilter;
 
-use crate::{RecordingError, StartError, cli, commands, output};
+use crate::{RecordingError, StartRecordingError, cli, commands, output};
 
 /// Reads the command line and does what it says, until the end or until interrupted.
 pub fn program() -> ExitCode {
@@ -33,7 +33,7 @@ pub fn program() -> ExitCode {
         .map_err(anyhow::Error::from)
         .and_then(|runtime| runtime.block_on(commands::run(cli)));
     outcome.unwrap_or_else(|error| {
-        output::complain(&format!("{error:#}"));
+        output::print_error(&format!("{error:#}"));
         if bad_usage(&error) {
             ExitCode::from(BAD_USAGE)
         } else {
@@ -65,6 +65,6 @@ fn bad_usage(error: &anyhow::Error) -> bool {
                 .downcast_ref()
                 .is_some_and(|error: &std::io::Error| by_system(error.kind()))
             || cause.downcast_ref().is_some_and(recording)
-            || matches!(cause.downcast_ref(), Some(StartError::File(error)) if recording(error))
+            || matches!(cause.downcast_ref(), Some(StartRecordingError::File(error)) if recording(error))
     })
 }

@@ -6,24 +6,24 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use crate::board::Board;
 use crate::event::FleetEvent;
+use crate::event_bus::EventBus;
 use crate::fleet::Fleet;
 use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
 /// A recording being played.
 pub struct Replay {
-    board: Arc<Board>,
+    bus: Arc<EventBus>,
     path: PathBuf,
     /// When its first and its last event arrived [unix ns].
     span: (i64, i64),
     unreadable: Vec<Unreadable>,
-    wheel: Mutex<Wheel>,
+    playhead: Mutex<Playhead>,
     turned: Condvar,
 }
 
 /// Where it is and how it moves.
-struct Wheel {
+struct Playhead {
     playing: bool,
     speed: f64,
     /// The moment of the recording that was shown at `since` [unix ns].
@@ -49,7 +49,7 @@ pub struct ReplayView {
     pub duration_s: f64,
 }
 
-impl Wheel {
+impl Playhead {
     fn now(&self, end: i64) -> i64 {
         if !self.playing {
             return self.at.min(end);
@@ -82,11 +82,11 @@ impl Replay {
         }
         let span = span.ok_or_else(|| RecordingError::Empty(path.display().to_string()))?;
         let replay = Arc::new(Self {
-            board: Arc::default(),
+            bus: Arc::default(),
             path: path.to_owned(),
             span,
             unreadable: unreadable.list(),
-            wheel: Mutex::new(Wheel {
+            playhead: Mutex::new(Playhead {
                 playing: true,
                 speed: 1.0,
                 at: span.0,
@@ -105,8 +105,8 @@ impl Replay {
     }
 
     /// Where its events arrive.
-    pub fn board(&self) -> &Arc<Board> {
-        &self.board
+    pub fn bus(&self) -> &Arc<EventBus> {
+        &self.bus
     }
 
     /// What is in the recording and cannot be read.
@@ -116,17 +116,17 @@ impl Replay {
 
     /// The moment of the recording that is shown [unix ns].
     pub fn now(&self) -> i64 {
-        self.wheel().now(self.span.1)
+        self.playhead().now(self.span.1)
     }
 
     /// How it is getting on.
     pub fn view(&self) -> ReplayView {
-        let wheel = self.wheel();
-        let at = wheel.jump.unwrap_or_else(|| wheel.now(self.span.1));
+        let playhead = self.playhead();
+        let at = playhead.jump.unwrap_or_else(|| playhead.now(self.span.1));
         ReplayView {
             file: self.path.display().to_string(),
-            playing: wheel.playing && at < self.span.1,
-            speed: wheel.speed,
+            playing: playhead.playing && at < self.span.1,
+            speed: playhead.speed,
             at_s: (at - self.span.0) as f64 * 1e-9,
             duration_s: (self.span.1 - self.span.0) as f64 * 1e-9,
         }
@@ -142,31 +142,31 @@ impl Replay {
         if let Some(at_s) = at_s.filter(|at_s| !at_s.is_finite()) {
             return Err(format!("{at_s} s is no moment"));
         }
-        let mut wheel = self.wheel();
-        wheel.settle(self.span.1);
+        let mut playhead = self.playhead();
+        playhead.settle(self.span.1);
         if let Some(at_s) = at_s {
             let at = self.span.0.saturating_add((at_s * 1e9) as i64);
-            wheel.jump = Some(at.clamp(self.span.0, self.span.1));
+            playhead.jump = Some(at.clamp(self.span.0, self.span.1));
         }
         // Played on at its end, it begins again.
-        if playing == Some(true) && at_s.is_none() && wheel.at >= self.span.1 {
-            wheel.jump = Some(self.span.0);
+        if playing == Some(true) && at_s.is_none() && playhead.at >= self.span.1 {
+            playhead.jump = Some(self.span.0);
         }
-        wheel.playing = playing.unwrap_or(wheel.playing);
-        wheel.speed = speed.unwrap_or(wheel.speed);
-        drop(wheel);
+        playhead.playing = playing.unwrap_or(playhead.playing);
+        playhead.speed = speed.unwrap_or(playhead.speed);
+        drop(playhead);
         self.turned.notify_all();
         Ok(())
     }
 
     /// Ends the playing.
     pub fn stop(&self) {
-        self.wheel().stop = true;
+        self.playhead().stop = true;
         self.turned.notify_all();
     }
 
-    fn wheel(&self) -> MutexGuard<'_, Wheel> {
-        self.wheel.lock().unwrap_or_else(PoisonError::into_inner)
+    fn playhead(&self) -> MutexGuard<'_, Playhead> {
+        self.playhead.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn play(&self) {
@@ -176,38 +176,38 @@ impl Replay {
     }
 
     fn play_until_stopped(&self) -> Result<(), RecordingError> {
-        let mut events = Ahead::open(&self.path)?;
+        let mut events = PeekedEvents::open(&self.path)?;
         loop {
             let (now, jump) = {
-                let mut wheel = self.wheel();
-                if wheel.stop {
+                let mut playhead = self.playhead();
+                if playhead.stop {
                     return Ok(());
                 }
-                (wheel.now(self.span.1), wheel.jump.take())
+                (playhead.now(self.span.1), playhead.jump.take())
             };
             if let Some(to) = jump {
                 events = self.jump(to)?;
-                let mut wheel = self.wheel();
-                wheel.at = to;
-                wheel.since = Instant::now();
+                let mut playhead = self.playhead();
+                playhead.at = to;
+                playhead.since = Instant::now();
                 continue;
             }
             while let Some(event) = events.next_until(now)? {
-                self.board.take(event);
+                self.bus.publish(event);
             }
-            self.board.fleet().tick(now);
-            let wheel = self.wheel();
-            if wheel.jump.is_none() && !wheel.stop {
+            self.bus.fleet().tick(now);
+            let playhead = self.playhead();
+            if playhead.jump.is_none() && !playhead.stop {
                 // Ten milliseconds of real time: less than from one snapshot to the next.
-                drop(self.turned.wait_timeout(wheel, Duration::from_millis(10)));
+                drop(self.turned.wait_timeout(playhead, Duration::from_millis(10)));
             }
         }
     }
 
     /// Plays from the begin up to `to` [unix ns] as fast as it goes, out of sight, and shows what comes out.
-    fn jump(&self, to: i64) -> Result<Ahead, RecordingError> {
+    fn jump(&self, to: i64) -> Result<PeekedEvents, RecordingError> {
         const TICK: i64 = 100_000_000;
-        let mut events = Ahead::open(&self.path)?;
+        let mut events = PeekedEvents::open(&self.path)?;
         let mut fleet = Fleet::default();
         let mut ticked = self.span.0;
         while let Some(event) = events.next_until(to)? {
@@ -219,18 +219,18 @@ impl Replay {
             fleet.apply(&event);
         }
         fleet.tick(to);
-        self.board.restart(fleet, to);
+        self.bus.replace_fleet(fleet, to);
         Ok(events)
     }
 }
 
 /// The events of a recording, with a look at the next.
-struct Ahead {
+struct PeekedEvents {
     events: Box<dyn Iterator<Item = Result<FleetEvent, RecordingError>> + Send>,
     next: Option<FleetEvent>,
 }
 
-impl Ahead {
+impl PeekedEvents {
     fn open(path: &Path) -> Result<Self, RecordingError> {
         Ok(Self {
             events: Box::new(read_events(path)?),

@@ -21,7 +21,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use pitwall::{Hub, Role};
+use pitwall::{FleetService, Role};
 use protocol::{Action, CarName, ParamsAction};
 use tempfile::TempDir;
 
@@ -34,8 +34,8 @@ pub fn named(name: &str) -> CarName {
 }
 
 /// The set in force and its revision, as a pit wall knows them.
-pub fn in_force(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
-    let fleet = hub.fleet();
+pub fn in_force(service: &FleetService, car: &CarName) -> Option<(String, u64)> {
+    let fleet = service.fleet();
     let params = fleet.car(car)?.params.as_ref()?;
     Some((params.set.name.clone(), params.revision))
 }
@@ -72,13 +72,13 @@ pub fn client(endpoint: &str) -> Role {
 }
 
 /// A pit wall that records: where cars dial, and the folder with the file.
-pub async fn recording() -> (String, Arc<Hub>, TempDir, PathBuf) {
+pub async fn recording() -> (String, Arc<FleetService>, TempDir, PathBuf) {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("session.mcap");
-    hub.start_recording(&file).await.expect("a new file");
-    (endpoint, hub, folder, file)
+    service.start_recording(&file).await.expect("a new file");
+    (endpoint, service, folder, file)
 }
 
 /// Waits until `condition` holds; panics with `what` when it does not within [`DEADLINE`].

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use pitwall::{Hub, Verdict, new_command_id};
+use pitwall::{FleetService, Verdict, new_command_id};
 use protocol::{
     Action, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps, Telemetry,
     Topic, Value, encode,
@@ -23,22 +23,27 @@ fn revision(verdict: &Verdict) -> u64 {
 async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_does() {
     const SWITCHES: u64 = 1000;
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let events = hub.tap();
-    hub.link().subscribe_recorded(true).await.expect("subscribed");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let events = service.subscribe();
+    service
+        .connection()
+        .subscribe_recorded(true)
+        .await
+        .expect("subscribed");
     let car = named("car-1");
     let node = start_real(&car, 0.0, &endpoint, None);
     assert!(
-        hub.wait_until(Duration::from_secs(90), |fleet| {
-            fleet
-                .car(&car)
-                .and_then(|car| car.pose)
-                .is_some_and(|(_, pose)| pose.update > 40)
-        })
-        .await,
+        service
+            .wait_until(Duration::from_secs(90), |fleet| {
+                fleet
+                    .car(&car)
+                    .and_then(|car| car.pose)
+                    .is_some_and(|(_, pose)| pose.update > 40)
+            })
+            .await,
         "the car drives"
     );
-    let mut expected = in_force(&hub, &car).map(|(_, revision)| revision);
+    let mut expected = in_force(&service, &car).map(|(_, revision)| revision);
     let mut switched_at = Vec::new();
     for switch in 0..SWITCHES {
         let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
@@ -49,8 +54,8 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
             action: select(name),
         };
         // A machine that stands still for a while is not what this looks for.
-        let verdict = hub
-            .link()
+        let verdict = service
+            .client()
             .send(&car, &command, system_tests::DEADLINE)
             .await
             .expect("a good command");
@@ -76,11 +81,11 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
     let mut poses = Vec::new();
     wait_until("the updates after the last switch", || {
         for event in events.try_iter() {
-            if let pitwall::Happening::Message {
+            if let pitwall::EventPayload::Message {
                 topic: Topic::RecordedPose,
                 telemetry,
                 ..
-            } = &event.happening
+            } = &event.payload
                 && let Telemetry::Pose(pose) = &**telemetry
             {
                 poses.push((pose.update, pose.pose, pose.twist.linear_x));
@@ -90,7 +95,7 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
     })
     .await;
     node.shutdown("test over");
-    hub.close().await;
+    service.close().await;
     // Every update is there, once and in order.
     assert!(poses.windows(2).all(|pair| pair[1].0 == pair[0].0 + 1));
     // A pose steps by what the car has driven. A busy machine may have cost scans, which is no switch's fault.
@@ -117,23 +122,23 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
 #[tokio::test(flavor = "multi_thread")]
 async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
     let endpoint = free_endpoint();
-    let first = Hub::open(&router(&endpoint)).await.expect("a link");
-    let second = Hub::open(&client(&endpoint)).await.expect("a link");
+    let first = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let second = FleetService::open(&client(&endpoint)).await.expect("a link");
     let car = named("car-1");
     let node = start_real(&car, 0.0, &endpoint, None);
-    for hub in [&first, &second] {
-        assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
-        wait_until("the set in force is known", || in_force(hub, &car).is_some()).await;
+    for service in [&first, &second] {
+        assert!(service.wait_for(&car, system_tests::DEADLINE).await);
+        wait_until("the set in force is known", || in_force(service, &car).is_some()).await;
     }
     // Each switches to its own set, expecting what it last knew: of two at once, one is told to look again.
-    let fight = |hub: Arc<Hub>, who: &'static str, name: &'static str| {
+    let fight = |service: Arc<FleetService>, who: &'static str, name: &'static str| {
         let car = car.clone();
         tokio::spawn(async move {
             let (mut done, mut stale) = (0, 0);
             for _ in 0..50 {
-                let expected = in_force(&hub, &car).map(|(_, revision)| revision);
-                let verdict = hub
-                    .link()
+                let expected = in_force(&service, &car).map(|(_, revision)| revision);
+                let verdict = service
+                    .client()
                     .command(&car, who, expected, select(name))
                     .await
                     .expect("a good command");
@@ -155,7 +160,7 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
     wait_until("both know the last revision", || {
         [&first, &second]
             .into_iter()
-            .all(|hub| in_force(hub, &car).is_some_and(|(_, r)| r == last))
+            .all(|service| in_force(service, &car).is_some_and(|(_, r)| r == last))
     })
     .await;
     assert_eq!(in_force(&first, &car), in_force(&second, &car));
@@ -168,10 +173,10 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
 async fn a_command_is_not_done_twice_even_across_a_restart() {
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = named("car-1");
     let node = start_real(&car, 0.0, &endpoint, Some(folder.path()));
-    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+    assert!(service.wait_for(&car, system_tests::DEADLINE).await);
     let command = Command {
         id: new_command_id(),
         operator: "ana".into(),
@@ -180,7 +185,8 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
     };
     let patience = Duration::from_secs(10);
     let send = async || {
-        hub.link()
+        service
+            .client()
             .send(&car, &command, patience)
             .await
             .expect("a good command")
@@ -190,16 +196,16 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
     let again = send().await;
     assert_eq!(revision(&done), revision(&again));
     // The laptop dies while its command is under way: dropping the question is all that the car sees of that.
-    drop(tokio::time::timeout(Duration::ZERO, hub.link().send(&car, &command, patience)).await);
+    drop(tokio::time::timeout(Duration::ZERO, service.client().send(&car, &command, patience)).await);
 
     // The car's process ends, and comes back.
     node.shutdown("power off");
     wait_until("the car is gone", || {
-        hub.fleet().car(&car).is_some_and(|car| !car.alive)
+        service.fleet().car(&car).is_some_and(|car| !car.alive)
     })
     .await;
-    let gone = hub
-        .link()
+    let gone = service
+        .client()
         .send(&car, &command, Duration::from_secs(1))
         .await
         .expect("a good command");
@@ -210,13 +216,13 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         gone.text(&car)
     );
     let node = start_real(&car, 0.0, &endpoint, Some(folder.path()));
-    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
+    assert!(service.wait_for(&car, system_tests::DEADLINE).await);
     wait_until("the set in force is known", || {
-        in_force(&hub, &car).is_some_and(|(name, _)| name == "lq")
+        in_force(&service, &car).is_some_and(|(name, _)| name == "lq")
     })
     .await;
-    let back = hub
-        .link()
+    let back = service
+        .client()
         .command(&car, "ana", None, select("hq"))
         .await
         .expect("a good command");
@@ -227,19 +233,19 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         "answered again, not done again"
     );
     wait_until("hq stays in force", || {
-        in_force(&hub, &car) == Some(("hq".into(), revision(&back)))
+        in_force(&service, &car) == Some(("hq".into(), revision(&back)))
     })
     .await;
     node.shutdown("test over");
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let mute = FakeCar::start_mute(&endpoint).await;
-    assert!(hub.wait_for(mute.name(), system_tests::DEADLINE).await);
+    assert!(service.wait_for(mute.name(), system_tests::DEADLINE).await);
     let command = |action| Command {
         id: new_command_id(),
         operator: "ana".into(),
@@ -247,8 +253,8 @@ async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
         action,
     };
     let patience = Duration::from_millis(500);
-    let none = hub
-        .link()
+    let none = service
+        .client()
         .send(mute.name(), &command(select("lq")), patience)
         .await
         .expect("a good command");
@@ -259,25 +265,25 @@ async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
         none.text(mute.name())
     );
     let nobody = named("nobody");
-    let gone = hub
-        .link()
+    let gone = service
+        .client()
         .send(&nobody, &command(select("lq")), patience)
         .await
         .expect("a good command");
     assert_eq!(gone.exit_code(), 4, "{gone:?}");
     drop(mute);
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = named("car-1");
     let node = start_real(&car, 0.0, &endpoint, None);
-    assert!(hub.wait_for(&car, system_tests::DEADLINE).await);
-    wait_until("the set in force is known", || in_force(&hub, &car).is_some()).await;
-    let before = in_force(&hub, &car);
+    assert!(service.wait_for(&car, system_tests::DEADLINE).await);
+    wait_until("the set in force is known", || in_force(&service, &car).is_some()).await;
+    let before = in_force(&service, &car);
     let put = |values: &[(&str, Value)]| {
         let values = values
             .iter()
@@ -322,8 +328,8 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
         (Action::Pose(far), "off the map"),
     ];
     for (action, word) in absurd {
-        let verdict = hub
-            .link()
+        let verdict = service
+            .client()
             .command(&car, "ana", None, action.clone())
             .await
             .expect("a good command");
@@ -339,8 +345,8 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
         ("sigma_hit", Value::Float(-1.0)),
         ("max_particles", Value::Int(-5)),
     ]);
-    let text = hub
-        .link()
+    let text = service
+        .client()
         .command(&car, "ana", None, both)
         .await
         .expect("good")
@@ -351,8 +357,8 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
     );
     // What is no number does not even leave the laptop.
     for value in [f64::NAN, f64::INFINITY] {
-        let error = hub
-            .link()
+        let error = service
+            .client()
             .command(&car, "ana", None, put(&[("sigma_hit", Value::Float(value))]))
             .await;
         assert!(error.is_err(), "{error:?}");
@@ -364,14 +370,14 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
         health: 0.0,
         recorded: true,
     };
-    let error = hub
-        .link()
+    let error = service
+        .client()
         .command(&car, "ana", None, Action::Rates(RatesAction::Set(rates)))
         .await;
     assert!(error.is_err(), "{error:?}");
-    assert_eq!(in_force(&hub, &car), before);
+    assert_eq!(in_force(&service, &car), before);
     node.shutdown("test over");
-    hub.close().await;
+    service.close().await;
 }
 
 #[test]
@@ -406,22 +412,22 @@ async fn acknowledgements_with_three_cars() {
     const SWITCHES: usize = 200;
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let cars = ["car-1", "car-2", "car-3"].map(named);
     let nodes: Vec<_> = cars
         .iter()
         .map(|car| start_real(car, 0.0, &endpoint, Some(&folder.path().join(car.as_str()))))
         .collect();
     for car in &cars {
-        wait_until("the set in force is known", || in_force(&hub, car).is_some()).await;
+        wait_until("the set in force is known", || in_force(&service, car).is_some()).await;
     }
     let (mut times, mut undisturbed, mut unanswered) = (Vec::new(), Vec::new(), 0);
     for switch in 0..SWITCHES {
         for car in &cars {
             let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
             let before = stolen();
-            let verdict = hub
-                .link()
+            let verdict = service
+                .client()
                 .command(car, "ana", None, select(name))
                 .await
                 .expect("a good command");
@@ -451,12 +457,12 @@ async fn acknowledgements_with_three_cars() {
         "switches of 3 cars acknowledged: {}; {unanswered} not within {:.0} s\n\
          of these while no processor time was taken away: {}\n",
         spread(times),
-        pitwall::PATIENCE.as_secs_f64(),
+        pitwall::REPLY_TIMEOUT.as_secs_f64(),
         spread(undisturbed),
     );
     std::io::Write::write_all(&mut std::io::stdout(), lines.as_bytes()).expect("stdout");
     for node in nodes {
         node.shutdown("measured");
     }
-    hub.close().await;
+    service.close().await;
 }

@@ -12,7 +12,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::LazyLock;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use pitwall::{PageOptions, PitWall, WallOptions, read_events};
+use pitwall::{PageOptions, PitWallOptions, PitWallServer, read_events};
 use serde_json::Value;
 use system_tests::{Behaviour, Browser, FakeCar, free_endpoint, router, wait_until};
 use tokio::sync::{Mutex, MutexGuard};
@@ -21,7 +21,7 @@ use tokio::sync::{Mutex, MutexGuard};
 static TURN: LazyLock<Mutex<()>> = LazyLock::new(Mutex::default);
 
 struct Stage {
-    wall: PitWall,
+    server: PitWallServer,
     endpoint: String,
     recordings: tempfile::TempDir,
     _turn: MutexGuard<'static, ()>,
@@ -33,7 +33,7 @@ impl Stage {
         let turn = TURN.lock().await;
         let endpoint = free_endpoint();
         let recordings = tempfile::tempdir().expect("a folder");
-        let wall = PitWall::start(WallOptions {
+        let server = PitWallServer::start(PitWallOptions {
             role: router(&endpoint),
             page: PageOptions {
                 address: ([127, 0, 0, 1], 0).into(),
@@ -43,7 +43,7 @@ impl Stage {
         .await
         .expect("a pit wall");
         Self {
-            wall,
+            server,
             endpoint,
             recordings,
             _turn: turn,
@@ -51,7 +51,7 @@ impl Stage {
     }
 
     async fn browser(&self) -> Browser {
-        Browser::open(self.wall.url(), 1366, 768).await
+        Browser::open(self.server.url(), 1366, 768).await
     }
 }
 
@@ -274,12 +274,12 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
             .wait("no alarm is open", "document.getElementById('alarm').hidden")
             .await;
     }
-    let origin = stage.wall.url().to_owned();
+    let origin = stage.server.url().to_owned();
     for browser in [ana, ben] {
         browser.expect_clean(&origin).await;
         browser.close().await;
     }
-    stage.wall.stop().await;
+    stage.server.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -373,8 +373,8 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .path();
     let markers: Vec<String> = read_events(&file)
         .expect("a recording")
-        .filter_map(|event| match event.expect("whole").happening {
-            pitwall::Happening::Marker { who, text } => Some(format!("{who}: {text}")),
+        .filter_map(|event| match event.expect("whole").payload {
+            pitwall::EventPayload::Marker { who, text } => Some(format!("{who}: {text}")),
             _ => None,
         })
         .collect();
@@ -393,11 +393,11 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .await;
     browser.picture("page-large").await;
     browser.key("Escape").await;
-    browser.expect_clean(stage.wall.url()).await;
+    browser.expect_clean(stage.server.url()).await;
 
     // The program ends: everything on the page is old, and says so.
-    let Stage { wall, .. } = stage;
-    wall.stop().await;
+    let Stage { server, .. } = stage;
+    server.stop().await;
     browser
         .wait("the page is grey", "document.body.classList.contains('cut') && document.getElementById('link').textContent.includes('no news for')")
         .await;
@@ -412,21 +412,25 @@ async fn a_recording_is_replayed_on_the_same_page() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("session.mcap");
     let endpoint = free_endpoint();
-    let hub = pitwall::Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = pitwall::FleetService::open(&router(&endpoint))
+        .await
+        .expect("a link");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
-    hub.start_recording(&file).await.expect("a new file");
+    service.start_recording(&file).await.expect("a new file");
     wait_until("two laps are recorded", || {
-        hub.fleet()
+        service
+            .fleet()
             .car(car.name())
             .is_some_and(|car| car.laps().len() >= 2)
     })
     .await;
-    hub.stop_recording()
+    service
+        .stop_recording()
         .await
         .expect("a recording")
         .expect("a good file");
     drop(car);
-    hub.close().await;
+    service.close().await;
 
     let replay = pitwall::Replay::start(&file).expect("a good file");
     // It waits at its begin until the page is there.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use pitwall::Hub;
+use pitwall::FleetService;
 use protocol::{
     Action, CarName, Command, CommandId, Key, LinkReport, Message, ParamsAction, Stamps, Topic, encode,
 };
@@ -100,25 +100,31 @@ const HEARD: [Topic; 11] = [
 #[tokio::test(flavor = "multi_thread")]
 async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    hub.link().subscribe_recorded(true).await.expect("subscribed");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    service
+        .connection()
+        .subscribe_recorded(true)
+        .await
+        .expect("subscribed");
     let car = CarName::new("car-1").expect("a good name");
     let node = start_real(&car, 0.0, &endpoint, None);
     let updates = || {
-        hub.fleet()
+        service
+            .fleet()
             .car(&car)
             .and_then(|car| car.pose)
             .map_or(0, |(_, pose)| pose.update)
     };
     assert!(
-        hub.wait_until(Duration::from_secs(90), |fleet| {
-            fleet
-                .car(&car)
-                .is_some_and(|car| car.params.is_some() && car.pose.is_some())
-        })
-        .await
+        service
+            .wait_until(Duration::from_secs(90), |fleet| {
+                fleet
+                    .car(&car)
+                    .is_some_and(|car| car.params.is_some() && car.pose.is_some())
+            })
+            .await
     );
-    let before = in_force(&hub, &car);
+    let before = in_force(&service, &car);
     let stranger = stranger(&endpoint).await;
     let garbage = garbage();
     for topic in Topic::all() {
@@ -148,7 +154,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     // What the car is asked or told is counted on the car, and it says so with its load.
     let expected = (ASKED.len() * garbage.len()) as u64;
     let counted = || {
-        let fleet = hub.fleet();
+        let fleet = service.fleet();
         fleet
             .car(&car)
             .and_then(|car| Some(car.load.as_ref()?.drops.payloads))
@@ -158,7 +164,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     // What the pit wall listens to is counted there, and stands in the log once.
     for topic in HEARD {
         wait_until(topic.as_str(), || {
-            let views = hub.fleet().view(pitwall::unix_now());
+            let views = service.fleet().view(pitwall::unix_now());
             let unreadable = views[0]
                 .streams
                 .get(topic.as_str())
@@ -167,7 +173,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
         })
         .await;
         let word = format!("{topic} cannot be read");
-        let fleet = hub.fleet();
+        let fleet = service.fleet();
         let said = fleet
             .log()
             .since(0)
@@ -178,13 +184,13 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     // The car drives on, on the set that it had, and takes commands.
     let last = updates();
     wait_until("the car drives on", || updates() > last + 40).await;
-    assert_eq!(in_force(&hub, &car), before);
-    let verdict = hub
-        .link()
+    assert_eq!(in_force(&service, &car), before);
+    let verdict = service
+        .client()
         .command(&car, "ana", None, Action::Params(ParamsAction::List))
         .await
         .expect("a good command");
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     node.shutdown("test over");
-    hub.close().await;
+    service.close().await;
 }

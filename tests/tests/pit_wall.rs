@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use pitwall::{Hub, Report, Verdict, read_events, unix_now};
+use pitwall::{FleetService, Report, Verdict, read_events, unix_now};
 use protocol::{CarName, Outcome, Topic};
 use system_tests::{
     Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, recording, router, select, wait_until,
@@ -13,10 +13,10 @@ async fn a_car_shows_up_and_is_blind_when_it_leaves() {
     let endpoint = free_endpoint();
     // The car is there before the pit wall: it dials until somebody answers.
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    assert!(hub.wait_for(car.name(), DEADLINE).await);
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    assert!(service.wait_for(car.name(), DEADLINE).await);
     let name = car.name().clone();
-    let view = || hub.fleet().car(&name).map(|car| car.view(unix_now()));
+    let view = || service.fleet().car(&name).map(|car| car.view(unix_now()));
     wait_until("everything that a card shows", || {
         view().is_some_and(|car| {
             car.state == "LOCALIZED"
@@ -29,7 +29,7 @@ async fn a_car_shows_up_and_is_blind_when_it_leaves() {
     })
     .await;
     wait_until("its map", || {
-        hub.fleet().car(&name).is_some_and(|car| car.map.is_some())
+        service.fleet().car(&name).is_some_and(|car| car.map.is_some())
     })
     .await;
     car.leave().await;
@@ -37,41 +37,42 @@ async fn a_car_shows_up_and_is_blind_when_it_leaves() {
         view().is_some_and(|car| car.state == "BLIND" && !car.alive)
     })
     .await;
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_second_program_joins_the_pit_wall_that_is_there() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
-    let viewer = Hub::open(&client(&endpoint)).await.expect("a link");
+    let viewer = FleetService::open(&client(&endpoint)).await.expect("a link");
     assert!(viewer.wait_for(car.name(), DEADLINE).await);
     let verdict = viewer
-        .link()
+        .client()
         .command(car.name(), "ana", None, select("lq"))
         .await
         .expect("a good command");
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     assert_eq!(car.set().name, "lq");
     wait_until("both see the switch", || {
-        [&hub, &viewer].map(|hub| in_force(hub, car.name()))
+        [&service, &viewer].map(|service| in_force(service, car.name()))
             == [Some(("lq".into(), 2)), Some(("lq".into(), 2))]
     })
     .await;
     viewer.close().await;
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn each_outcome_of_a_command_is_told_apart() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
     let mute = FakeCar::start_mute(&endpoint).await;
-    assert!(hub.wait_for(car.name(), DEADLINE).await && hub.wait_for(mute.name(), DEADLINE).await);
+    assert!(service.wait_for(car.name(), DEADLINE).await && service.wait_for(mute.name(), DEADLINE).await);
     let give = async |name: &CarName, expect, action| {
-        hub.link()
+        service
+            .client()
             .command(name, "ana", expect, action)
             .await
             .expect("a good command")
@@ -99,45 +100,45 @@ async fn each_outcome_of_a_command_is_told_apart() {
         .into();
     assert_eq!(texts.len(), 5, "each reads differently: {texts:?}");
     assert_eq!(car.set().name, "lq", "only the first command changed anything");
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn bytes_that_are_no_message_are_counted_and_said_once() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let babbles = Behaviour {
         babbles: true,
         ..Behaviour::default()
     };
     let car = FakeCar::start("car-1", &endpoint, babbles).await;
     wait_until("several payloads were refused", || {
-        let view = hub.fleet().car(car.name()).map(|car| car.view(unix_now()));
+        let view = service.fleet().car(car.name()).map(|car| car.view(unix_now()));
         view.and_then(|car| Some(car.streams.get("load")?.unreadable >= 3))
             .unwrap_or(false)
     })
     .await;
-    let said = hub
+    let said = service
         .fleet()
         .log()
         .since(0)
         .filter(|entry| entry.kind == "unreadable")
         .count();
     assert_eq!(said, 1);
-    hub.close().await;
+    service.close().await;
 }
 
 /// It was INIT, "no health message yet", for ever.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_pit_wall_that_is_too_old_for_a_car_says_so() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let newer = Behaviour {
         newer: true,
         ..Behaviour::default()
     };
     let car = FakeCar::start("car-1", &endpoint, newer).await;
-    let view = || hub.fleet().car(car.name()).map(|car| car.view(unix_now()));
+    let view = || service.fleet().car(car.name()).map(|car| car.view(unix_now()));
     wait_until("the car's messages are not understood", || {
         view().is_some_and(|car| {
             car.state == "UNKNOWN"
@@ -149,19 +150,20 @@ async fn a_pit_wall_that_is_too_old_for_a_car_says_so() {
     let view = view().expect("the car is there");
     assert!(view.pose.is_some() && !view.blind, "what can be read is shown");
     assert_eq!(view.streams["health"].missing, 0, "what came is not missing");
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_of_three_cars_holds_every_message() {
-    let (endpoint, hub, _folder, file) = recording().await;
+    let (endpoint, service, _folder, file) = recording().await;
     let mut cars = Vec::new();
     for name in ["car-1", "car-2", "car-3"] {
         cars.push(FakeCar::start(name, &endpoint, Behaviour::default()).await);
     }
     wait_until("two laps", || {
         cars.iter().all(|car| {
-            hub.fleet()
+            service
+                .fleet()
                 .car(car.name())
                 .is_some_and(|car| car.laps().len() >= 2)
         })
@@ -177,7 +179,7 @@ async fn a_recording_of_three_cars_holds_every_message() {
         );
     }
     wait_until("the last message has come", || {
-        let status = hub.recording().expect("a recording");
+        let status = service.recording().expect("a recording");
         let streams = &status.summary.streams;
         streams.len() == published.len()
             && streams
@@ -185,13 +187,13 @@ async fn a_recording_of_three_cars_holds_every_message() {
                 .all(|s| s.gaps.last == published[&(s.car.clone(), s.topic)])
     })
     .await;
-    let live = hub.fleet().view(0);
-    let summary = hub
+    let live = service.fleet().view(0);
+    let summary = service
         .stop_recording()
         .await
         .expect("a recording")
         .expect("a good file");
-    hub.close().await;
+    service.close().await;
 
     // Newest-wins topics begin with the first message that found a route; what a car keeps begins with its first.
     for stream in &summary.streams {
@@ -243,7 +245,7 @@ async fn a_recording_of_three_cars_holds_every_message() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
-    let (endpoint, hub, _folder, _) = recording().await;
+    let (endpoint, service, _folder, _) = recording().await;
     let slow = Behaviour {
         withholds: true,
         ..Behaviour::default()
@@ -251,7 +253,7 @@ async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
     let car = FakeCar::start("car-1", &endpoint, slow).await;
     let leaver = FakeCar::start("car-2", &endpoint, Behaviour::default()).await;
     let recorded = |car: &CarName, topic| {
-        let streams = hub.recording().expect("a recording").summary.streams;
+        let streams = service.recording().expect("a recording").summary.streams;
         let mut streams = streams.iter().filter(|s| s.car == *car && s.topic == topic);
         streams.next().map_or(0, |s| s.gaps.received)
     };
@@ -264,12 +266,12 @@ async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
 
     // It drives on, so that there is always something that has not come.
     let by_then = car.published();
-    let summary = hub
+    let summary = service
         .stop_recording()
         .await
         .expect("a recording")
         .expect("a good file");
-    hub.close().await;
+    service.close().await;
     assert_eq!(
         summary.unanswered.iter().map(CarName::as_str).collect::<Vec<_>>(),
         ["car-2"],
@@ -303,27 +305,27 @@ async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_that_was_cut_off_is_recovered() {
     let endpoint = free_endpoint();
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("session.mcap");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
-    hub.start_recording(&file).await.expect("a new file");
-    let poses = |hub: &Hub| {
-        let streams = hub.recording().expect("a recording").summary.streams;
+    service.start_recording(&file).await.expect("a new file");
+    let poses = |service: &FleetService| {
+        let streams = service.recording().expect("a recording").summary.streams;
         streams
             .iter()
             .find(|s| s.topic == Topic::Pose)
             .map_or(0, |s| s.gaps.received)
     };
-    wait_until("a second of poses is in the file", || poses(&hub) > 40).await;
-    let on_disk = poses(&hub);
+    wait_until("a second of poses is in the file", || poses(&service) > 40).await;
+    let on_disk = poses(&service);
     // What a power cut leaves behind: the file as it is now, without its end, and torn in its last record.
     let mut bytes = std::fs::read(&file).expect("readable");
     bytes.truncate(bytes.len() - 3);
     let torn = folder.path().join("torn.mcap");
     std::fs::write(&torn, bytes).expect("written");
     drop(car);
-    hub.close().await;
+    service.close().await;
 
     assert!(
         read_events(&torn).expect("opens").any(|event| event.is_err()),
@@ -340,8 +342,8 @@ async fn a_recording_that_was_cut_off_is_recovered() {
         .iter()
         .filter(|event| {
             matches!(
-                event.happening,
-                pitwall::Happening::Message {
+                event.payload,
+                pitwall::EventPayload::Message {
                     topic: Topic::Pose,
                     ..
                 }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::{Child, Command as Process, Output, Stdio};
 use std::time::{Duration, Instant};
 
-use pitwall::{Hub, Verdict, new_command_id};
+use pitwall::{FleetService, Verdict, new_command_id};
 use protocol::{Action, CarName, Command, EventKind, Outcome, ParamsAction, Telemetry};
 use system_tests::{FakeCar, free_endpoint, named, router, select, wait_until};
 
@@ -75,15 +75,15 @@ fn command(name: &str) -> Command {
 }
 
 /// The set in force and its revision, of a car that is there.
-fn in_force(hub: &Hub, car: &CarName) -> Option<(String, u64)> {
-    hub.fleet().car(car).filter(|car| car.alive)?;
-    system_tests::in_force(hub, car)
+fn in_force(service: &FleetService, car: &CarName) -> Option<(String, u64)> {
+    service.fleet().car(car).filter(|car| car.alive)?;
+    system_tests::in_force(service, car)
 }
 
 /// Waits for a car in a process of its own, which takes its time on a busy machine.
-async fn driving(hub: &Hub, car: &CarName) {
+async fn driving(service: &FleetService, car: &CarName) {
     let deadline = Instant::now() + Duration::from_secs(90);
-    while in_force(hub, car).is_none() {
+    while in_force(service, car).is_none() {
         assert!(Instant::now() < deadline, "{car} did not come");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
@@ -97,12 +97,12 @@ async fn driving(hub: &Hub, car: &CarName) {
 async fn each_outcome_has_its_exit_code_and_its_words() {
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let real = named("car-1");
     let _car = car("car-1", &endpoint, folder.path());
     let mute = FakeCar::start_mute(&endpoint).await;
-    assert!(hub.wait_for(mute.name(), system_tests::DEADLINE).await);
-    driving(&hub, &real).await;
+    assert!(service.wait_for(mute.name(), system_tests::DEADLINE).await);
+    driving(&service, &real).await;
     let file = |name: &str, text: &str| {
         let path = folder.path().join(name);
         std::fs::write(&path, text).expect("written");
@@ -222,7 +222,7 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
     assert_eq!((code, &verdict["verdict"]), (3, &"answered".into()), "{said}");
     // On a busy machine a car may send nothing for longer than `cars` listens by itself.
     wait_until("the car is heard", || {
-        hub.fleet().car(&real).is_some_and(|car| car.pose.is_some())
+        service.fleet().car(&real).is_some_and(|car| car.pose.is_some())
     })
     .await;
     let (code, said) = say(&endpoint, &["--json", "cars", "--wait", "8"]).await;
@@ -242,20 +242,20 @@ async fn each_outcome_has_its_exit_code_and_its_words() {
         assert!(car["streams"]["pose"][noun].is_number(), "{noun}: {said}");
     }
     drop(mute);
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
-    let events = hub.tap();
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let events = service.subscribe();
     let real = named("car-1");
     let _car = car("car-1", &endpoint, folder.path());
-    driving(&hub, &real).await;
+    driving(&service, &real).await;
     for (round, name) in ["lq", "hq", "lq", "hq"].into_iter().enumerate() {
-        let before = in_force(&hub, &real).expect("known");
+        let before = in_force(&service, &real).expect("known");
         while events.try_recv().is_ok() {}
         let mut laptop = Killed(
             wall(&endpoint, &["params", "car-1", "select", name])
@@ -265,8 +265,8 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         // Killed while it finds the car, or as soon as the car says that the set has changed.
         if round.is_multiple_of(2) {
             wait_until("the set has changed", || {
-                events.try_iter().any(|event| match &event.happening {
-                    pitwall::Happening::Message { telemetry, .. } => matches!(
+                events.try_iter().any(|event| match &event.payload {
+                    pitwall::EventPayload::Message { telemetry, .. } => matches!(
                         &**telemetry,
                         Telemetry::Event(event) if matches!(event.kind, EventKind::ParametersChanged { .. })
                     ),
@@ -277,8 +277,8 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         }
         laptop.kill();
         // The next one is told what is in force, and what it is told is what the car does.
-        let verdict = hub
-            .link()
+        let verdict = service
+            .client()
             .command(&real, "ben", None, Action::Params(ParamsAction::List))
             .await
             .expect("a good command");
@@ -290,9 +290,9 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         assert!(now == before || now == after, "{before:?} became {now:?}");
         assert!(!round.is_multiple_of(2) || now == after, "{now:?}");
         // Given again, it ends in the set that was wanted.
-        let again = hub
-            .link()
-            .send(&real, &command(name), pitwall::PATIENCE)
+        let again = service
+            .client()
+            .send(&real, &command(name), pitwall::REPLY_TIMEOUT)
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{again:?}");
@@ -302,37 +302,40 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         assert_eq!(answer.set.name, name);
         // Its revision too: selecting the same set again is a change of its own.
         wait_until("the set that was wanted", || {
-            in_force(&hub, &real) == Some((name.to_owned(), answer.set.revision))
+            in_force(&service, &real) == Some((name.to_owned(), answer.set.revision))
         })
         .await;
     }
     // Whose doing it was stands in the log.
-    let said = hub
+    let said = service
         .fleet()
         .log()
         .since(0)
         .any(|entry| entry.who.as_deref() == Some("ana"));
     assert!(said);
-    hub.close().await;
+    service.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_told() {
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
-    let hub = Hub::open(&router(&endpoint)).await.expect("a link");
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let real = named("car-1");
     let mut node = car("car-1", &endpoint, folder.path());
-    driving(&hub, &real).await;
+    driving(&service, &real).await;
     // Killed when the command has just left, and later and later in its way.
     for (name, microseconds) in [("lq", 0), ("hq", 2_000), ("lq", 20_000)] {
-        let before = in_force(&hub, &real).expect("known");
+        let before = in_force(&service, &real).expect("known");
         let command = command(name);
-        let (verdict, ()) = tokio::join!(hub.link().send(&real, &command, pitwall::PATIENCE), async {
-            // Not a wait for anything: the moment is what is tried.
-            tokio::time::sleep(Duration::from_micros(microseconds)).await;
-            node.kill();
-        });
+        let (verdict, ()) = tokio::join!(
+            service.client().send(&real, &command, pitwall::REPLY_TIMEOUT),
+            async {
+                // Not a wait for anything: the moment is what is tried.
+                tokio::time::sleep(Duration::from_micros(microseconds)).await;
+                node.kill();
+            }
+        );
         let verdict = verdict.expect("a good command");
         let text = verdict.text(&real);
         match &verdict {
@@ -344,11 +347,11 @@ async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_
             Verdict::NoSuchCar => assert!(text.contains("NO SUCH CAR"), "{text}"),
             Verdict::Unreadable { .. } => panic!("{text}"),
         }
-        wait_until("the car is gone", || in_force(&hub, &real).is_none()).await;
+        wait_until("the car is gone", || in_force(&service, &real).is_none()).await;
         node = car("car-1", &endpoint, folder.path());
-        driving(&hub, &real).await;
-        let known = hub
-            .link()
+        driving(&service, &real).await;
+        let known = service
+            .client()
             .command(&real, "ben", None, Action::Params(ParamsAction::List))
             .await
             .expect("a good command");
@@ -361,16 +364,16 @@ async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_
             assert_eq!(now, name, "what was acknowledged is kept");
         }
         // The same command once more: done now, or answered as it was done then.
-        let again = hub
-            .link()
-            .send(&real, &command, pitwall::PATIENCE)
+        let again = service
+            .client()
+            .send(&real, &command, pitwall::REPLY_TIMEOUT)
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{}", again.text(&real));
         wait_until("the set that was wanted", || {
-            in_force(&hub, &real).is_some_and(|(set, _)| set == name)
+            in_force(&service, &real).is_some_and(|(set, _)| set == name)
         })
         .await;
     }
-    hub.close().await;
+    service.close().await;
 }

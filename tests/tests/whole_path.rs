@@ -6,7 +6,7 @@ use std::sync::Arc;
 use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::sensors::BagPlayer;
 use car_node::sensors::bag::{Bag, Topics};
-use pitwall::{Happening, Verdict, read_events};
+use pitwall::{EventPayload, Verdict, read_events};
 use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
 use synpf::TrackMap;
 use system_tests::{DEADLINE, recording, room, true_pose, wait_until, write_bag};
@@ -36,14 +36,15 @@ fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
-    let (endpoint, hub, folder, file) = recording().await;
+    let (endpoint, service, folder, file) = recording().await;
     let node = start("car-1", folder.path(), &endpoint);
     let car = CarName::new("car-1").expect("a good name");
-    assert!(hub.wait_for(&car, DEADLINE).await, "the car shows up");
+    assert!(service.wait_for(&car, DEADLINE).await, "the car shows up");
 
     // A switch in mid-drive: done, at an update that it names, and both sides agree.
     wait_until("two seconds of poses", || {
-        hub.fleet()
+        service
+            .fleet()
             .car(&car)
             .and_then(|car| car.pose)
             .is_some_and(|(_, pose)| pose.update > 80)
@@ -53,8 +54,8 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
         name: "lq".into(),
         revert_after_ms: None,
     });
-    let verdict = hub
-        .link()
+    let verdict = service
+        .client()
         .command(&car, "ana", None, select)
         .await
         .expect("a good command");
@@ -67,7 +68,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
         "{verdict:?}"
     );
     wait_until("the pit wall knows the set in force", || {
-        let fleet = hub.fleet();
+        let fleet = service.fleet();
         let params = fleet.car(&car).and_then(|car| car.params.as_ref());
         params.is_some_and(|params| {
             params.set.name == "lq" && params.revision == answer.set.revision && params.who == "ana"
@@ -78,7 +79,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
     wait_until("the bag has ended", || node.source_ended()).await;
     // The last messages are on their way.
     wait_until("the recording has every update", || {
-        let status = hub.recording().expect("a recording");
+        let status = service.recording().expect("a recording");
         let updates = status
             .summary
             .streams
@@ -87,13 +88,13 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
         updates.is_some_and(|s| s.gaps.last >= 310 && s.gaps.missing == 0)
     })
     .await;
-    let summary = hub
+    let summary = service
         .stop_recording()
         .await
         .expect("a recording")
         .expect("a whole file");
     node.shutdown("test over");
-    hub.close().await;
+    service.close().await;
     assert_eq!(summary.missing(), 0, "{summary}");
 
     let (rmse, poses) = position_rmse(&file);
@@ -113,12 +114,12 @@ fn position_rmse(file: &Path) -> (f64, usize) {
     let mut updates = Vec::new();
     let mut truth = Vec::new();
     for event in read_events(file).expect("a recording") {
-        let Happening::Message {
+        let EventPayload::Message {
             topic,
             header,
             telemetry,
             ..
-        } = event.expect("a good event").happening
+        } = event.expect("a good event").payload
         else {
             continue;
         };
@@ -157,16 +158,16 @@ fn position_rmse(file: &Path) -> (f64, usize) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn three_cars_are_recorded_without_a_hole() {
-    let (endpoint, hub, folder, _) = recording().await;
+    let (endpoint, service, folder, _) = recording().await;
     let nodes: Vec<_> = ["car-1", "car-2", "car-3"]
         .map(|name| start(name, folder.path(), &endpoint))
         .into();
     wait_until("all bags have ended", || nodes.iter().all(Node::source_ended)).await;
     wait_until("nothing is missing", || {
-        hub.recording().is_some_and(|s| s.summary.missing() == 0)
+        service.recording().is_some_and(|s| s.summary.missing() == 0)
     })
     .await;
-    let summary = hub
+    let summary = service
         .stop_recording()
         .await
         .expect("a recording")
@@ -174,7 +175,7 @@ async fn three_cars_are_recorded_without_a_hole() {
     for node in nodes {
         node.shutdown("test over");
     }
-    hub.close().await;
+    service.close().await;
     assert_eq!(summary.missing(), 0, "{summary}");
     for topic in [
         Topic::RecordedPose,

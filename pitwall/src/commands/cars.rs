@@ -6,20 +6,21 @@ use std::time::Duration;
 use pitwall::unix_now;
 
 use super::open;
-use crate::cli::LinkOptions;
+use crate::cli::NetworkOptions;
 use crate::output;
+use crate::terminal::text;
 
-pub(super) async fn run(link: &LinkOptions, wait: Duration, json: bool) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
+pub(super) async fn run(network: &NetworkOptions, wait: Duration, json: bool) -> anyhow::Result<ExitCode> {
+    let service = open(network).await?;
     super::time_or_interrupt(Some(wait)).await;
-    let cars = hub.fleet().view(unix_now());
+    let cars = service.fleet().view(unix_now());
     if json {
-        output::say_json(&cars)?;
+        output::print_json(&cars)?;
     } else if cars.is_empty() {
-        output::note("no car is on this link");
+        output::print_note("no car is on this link");
     } else {
-        output::say(&output::table(&cars));
+        output::print(&text::table(&cars));
     }
-    hub.close().await;
+    service.close().await;
     Ok(ExitCode::SUCCESS)
 }

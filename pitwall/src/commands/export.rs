@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use pitwall::{Fleet, Happening, RecordingError, UnreadableCount, read_events};
+use pitwall::{EventPayload, Fleet, RecordingError, UnreadableCount, read_events};
 use protocol::{Telemetry, Topic};
 use serde_json::json;
 
@@ -44,12 +44,12 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     for event in &events {
         fleet.apply(event);
         unreadable.take(event);
-        let Happening::Message {
+        let EventPayload::Message {
             topic,
             header,
             telemetry,
             ..
-        } = &event.happening
+        } = &event.payload
         else {
             continue;
         };
@@ -99,14 +99,14 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     }
     let [poses, truths, healths] = counts;
     let unreadable = unreadable.list();
-    super::complain_of(&unreadable);
+    super::print_unreadable(&unreadable);
     if json {
-        output::say_json(&json!({
+        output::print_json(&json!({
             "folder": folder, "poses": poses, "truths": truths, "healths": healths, "laps": lap_count,
             "unreadable": unreadable,
         }))?;
     } else {
-        output::say(&format!(
+        output::print(&format!(
             "{}: {poses} poses, {truths} true poses, {healths} health messages, {lap_count} laps",
             folder.display()
         ));

@@ -1,6 +1,7 @@
 //! The verbs.
 
 mod cars;
+mod control;
 mod events;
 mod export;
 mod params;
@@ -8,17 +9,16 @@ mod record;
 mod replay;
 mod report;
 mod serve;
-mod steer;
 mod watch;
 
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pitwall::{Hub, PageOptions, Role, Unreadable};
+use pitwall::{FleetService, PageOptions, Role, Unreadable};
 use protocol::CarName;
 
-use crate::cli::{Cli, LinkOptions, Verb};
+use crate::cli::{Cli, NetworkOptions, Verb};
 use crate::output;
 
 /// How long a car may take to be found: those that dial a pit wall that was just opened try again every second.
@@ -35,16 +35,16 @@ pub(crate) struct BadUsage(String);
 /// Does what the command line says.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     let Cli {
-        link,
+        network,
         json,
         page,
         verb,
     } = cli;
     let Some(verb) = verb else {
-        return serve::run(&link, page, json).await;
+        return serve::run(&network, page, json).await;
     };
     match verb {
-        Verb::Cars { wait } => cars::run(&link, wait, json).await,
+        Verb::Cars { wait } => cars::run(&network, wait, json).await,
         Verb::Watch {
             car,
             time,
@@ -52,17 +52,17 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             wait,
         } => {
             let patience = time.map_or(wait, |time| time.min(wait));
-            watch::run(&link, car, time, rate, patience, json).await
+            watch::run(&network, car, time, rate, patience, json).await
         }
-        Verb::Params { car, verb } => params::run(&link, &car, verb, json).await,
-        Verb::Locate { car, how } => steer::locate(&link, &car, &how, json).await,
-        Verb::Rates { car, rates } => steer::rates(&link, &car, &rates, json).await,
-        Verb::Auto { car, on } => steer::auto(&link, &car, on, json).await,
+        Verb::Params { car, verb } => params::run(&network, &car, verb, json).await,
+        Verb::Locate { car, how } => control::locate(&network, &car, &how, json).await,
+        Verb::Rates { car, rates } => control::rates(&network, &car, &rates, json).await,
+        Verb::Auto { car, on } => control::auto(&network, &car, on, json).await,
         Verb::Events { car, follow, wait } => {
             let patience = if follow { wait } else { FIND };
-            events::run(&link, car, follow, patience, json).await
+            events::run(&network, car, follow, patience, json).await
         }
-        Verb::Record { output, time } => record::record(&link, &output, time, json).await,
+        Verb::Record { output, time } => record::record(&network, &output, time, json).await,
         Verb::Replay { file, speed, at } => {
             let options = PageOptions {
                 address: page.address,
@@ -76,31 +76,31 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     }
 }
 
-async fn open(options: &LinkOptions) -> anyhow::Result<Arc<Hub>> {
+async fn open(options: &NetworkOptions) -> anyhow::Result<Arc<FleetService>> {
     let role = Role::choose(&options.listen, &options.connect);
     tracing::info!("{role}");
-    Ok(Hub::open(&role).await?)
+    Ok(FleetService::open(&role).await?)
 }
 
 /// Waits for a car, and says so where that takes longer than usual: the laptop is often started first. False when it is not
 /// there within `patience`, or when the program is asked to stop.
-async fn await_car(hub: &Hub, car: &CarName, patience: Duration) -> bool {
+async fn await_car(service: &FleetService, car: &CarName, patience: Duration) -> bool {
     let usual = FIND.min(patience);
-    if hub.wait_for(car, usual).await {
+    if service.wait_for(car, usual).await {
         return true;
     }
     let longer = patience.saturating_sub(usual);
     if longer.is_zero() {
         return false;
     }
-    output::note(&format!(
+    output::print_note(&format!(
         "{car} is not there yet: waiting for it, {} s at most; Ctrl-C ends it",
         longer.as_secs_f64().ceil()
     ));
     tokio::select! {
-        found = hub.wait_for(car, longer) => {
+        found = service.wait_for(car, longer) => {
             if found {
-                output::note(&format!("{car} is there"));
+                output::print_note(&format!("{car} is there"));
             }
             found
         }
@@ -109,22 +109,22 @@ async fn await_car(hub: &Hub, car: &CarName, patience: Duration) -> bool {
 }
 
 /// Says that a car is not there.
-async fn no_such_car(hub: &Hub, car: &CarName) -> ExitCode {
-    let others: Vec<_> = hub.fleet().cars().map(|car| car.name.to_string()).collect();
+async fn no_such_car(service: &FleetService, car: &CarName) -> ExitCode {
+    let others: Vec<_> = service.fleet().cars().map(|car| car.name.to_string()).collect();
     let others = if others.is_empty() {
         "no car is on this link".to_owned()
     } else {
         format!("there are {}", others.join(", "))
     };
-    output::complain(&format!("no such car: {car}; {others}"));
-    hub.close().await;
+    output::print_error(&format!("no such car: {car}; {others}"));
+    service.close().await;
     ExitCode::from(NO_SUCH_CAR)
 }
 
 /// Says what of a recording cannot be read.
-fn complain_of(unreadable: &[Unreadable]) {
+fn print_unreadable(unreadable: &[Unreadable]) {
     for stream in unreadable {
-        output::complain(&stream.to_string());
+        output::print_error(&stream.to_string());
     }
 }
 

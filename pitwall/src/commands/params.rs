@@ -11,9 +11,9 @@ use protocol::{
 };
 use serde::Deserialize;
 
-use super::steer::{give, reply, tell};
+use super::control::{give, reply, tell};
 use super::{BadUsage, FIND, no_such_car, open};
-use crate::cli::{LinkOptions, ParamsVerb};
+use crate::cli::{NetworkOptions, ParamsVerb};
 use crate::output;
 
 /// Exit code: the car does not do that.
@@ -23,7 +23,7 @@ const REFUSED: u8 = 3;
 const NO_ANSWER: u8 = 5;
 
 pub(super) async fn run(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     verb: Option<ParamsVerb>,
     json: bool,
@@ -33,17 +33,17 @@ pub(super) async fn run(
         u32::try_from(time.as_millis()).map_err(fault)
     };
     let (action, expect) = match verb {
-        None | Some(ParamsVerb::Get) => return get(link, car, json).await,
-        Some(ParamsVerb::List) => return list(link, car, None, json).await,
-        Some(ParamsVerb::Diff { a, b }) => return list(link, car, Some((a, b)), json).await,
-        Some(ParamsVerb::Shadow { name: None }) => return shadow(link, car, json).await,
+        None | Some(ParamsVerb::Get) => return get(network, car, json).await,
+        Some(ParamsVerb::List) => return list(network, car, None, json).await,
+        Some(ParamsVerb::Diff { a, b }) => return list(network, car, Some((a, b)), json).await,
+        Some(ParamsVerb::Shadow { name: None }) => return shadow(network, car, json).await,
         Some(ParamsVerb::Shadow { name }) => {
             let name = name.filter(|name| name != "off");
             let begun = name.clone();
             let action = Action::Params(ParamsAction::Shadow { name });
-            let code = give(link, car, action, None, json).await?;
+            let code = give(network, car, action, None, json).await?;
             if let Some(name) = begun.filter(|_| code == ExitCode::SUCCESS && !json) {
-                output::say(&format!(
+                output::print(&format!(
                     "{name} runs in its shadow; `pitwall params {car} shadow` compares the two"
                 ));
             }
@@ -68,40 +68,40 @@ pub(super) async fn run(
         Some(ParamsVerb::Revert { change }) => (ParamsAction::Revert, change),
         Some(ParamsVerb::Delete { name, change }) => (ParamsAction::Delete { name }, change),
     };
-    give(link, car, Action::Params(action), expect.expect, json).await
+    give(network, car, Action::Params(action), expect.expect, json).await
 }
 
 /// The set in force, as the car last said it.
-async fn get(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
-    let params = match last_said(link, car, "which set is in force", |car| car.params.clone()).await? {
+async fn get(network: &NetworkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
+    let params = match last_said(network, car, "which set is in force", |car| car.params.clone()).await? {
         Ok(params) => params,
         Err(code) => return Ok(code),
     };
     if json {
-        output::say_json(&params)?;
+        output::print_json(&params)?;
     } else {
-        output::say(&describe(&params));
+        output::print(&describe(&params));
     }
     Ok(ExitCode::SUCCESS)
 }
 
 /// What a car last said of something, once it has; else the exit code, when why has been told.
 async fn last_said<T>(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     of: &str,
     find: impl Fn(&Car) -> Option<T>,
 ) -> anyhow::Result<Result<T, ExitCode>> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(Err(no_such_car(&hub, car).await));
+    let service = open(network).await?;
+    if !service.wait_for(car, FIND).await {
+        return Ok(Err(no_such_car(&service, car).await));
     }
     let find = |fleet: &Fleet| fleet.car(car).and_then(&find);
-    hub.wait_until(FIND, |fleet| find(fleet).is_some()).await;
-    let said = find(&hub.fleet());
-    hub.close().await;
+    service.wait_until(FIND, |fleet| find(fleet).is_some()).await;
+    let said = find(&service.fleet());
+    service.close().await;
     Ok(said.ok_or_else(|| {
-        output::complain(&format!(
+        output::print_error(&format!(
             "{car}: NO ANSWER: it has not said {of}. Is its node older than this program?"
         ));
         ExitCode::from(NO_ANSWER)
@@ -135,34 +135,18 @@ fn values(set: &ParameterSet) -> Vec<String> {
 }
 
 /// How the set in the shadow compares, as the car last said it.
-async fn shadow(link: &LinkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
+async fn shadow(network: &NetworkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
     let of = "whether a set runs in the shadow";
-    let shadow = match last_said(link, car, of, |car| car.shadow.clone()).await? {
+    let shadow = match last_said(network, car, of, |car| car.shadow.clone()).await? {
         Ok(shadow) => shadow,
         Err(code) => return Ok(code),
     };
     if json {
-        output::say_json(&shadow)?;
+        output::print_json(&shadow)?;
     } else {
-        output::say(&compare(car, &shadow));
+        output::print(&compare(car, &shadow));
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// The comparison on one line.
-pub(super) fn compare_short(shadow: &Shadow) -> String {
-    match (&shadow.set, &shadow.comparison) {
-        (Some(set), Some(c)) => format!(
-            "shadow  {set} fits better on {:.0} % of {} scans, {} on {:.0} %; poses {:.3} m apart",
-            c.shadow_better * 100.0,
-            c.scans,
-            c.in_force.name,
-            c.force_better * 100.0,
-            c.distance,
-        ),
-        (Some(set), None) => format!("shadow  {set}; nothing to compare yet"),
-        (None, _) => "shadow  none".to_owned(),
-    }
 }
 
 fn compare(car: &CarName, shadow: &Shadow) -> String {
@@ -224,24 +208,27 @@ fn compare(car: &CarName, shadow: &Shadow) -> String {
 
 /// All sets, or how two of them differ.
 async fn list(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     diff: Option<(String, String)>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(no_such_car(&hub, car).await);
+    let service = open(network).await?;
+    if !service.wait_for(car, FIND).await {
+        return Ok(no_such_car(&service, car).await);
     }
     let action = Action::Params(ParamsAction::List);
-    let verdict = hub.link().command(car, &link.operator(), None, action).await?;
+    let verdict = service
+        .client()
+        .command(car, &network.operator(), None, action)
+        .await?;
     let Some(Reply::Sets(sets)) = reply(&verdict) else {
-        return tell(&hub, car, &verdict, json).await;
+        return tell(&service, car, &verdict, json).await;
     };
-    hub.close().await;
+    service.close().await;
     let Some((a, b)) = diff else {
         if json {
-            output::say_json(sets)?;
+            output::print_json(sets)?;
         } else {
             for StoredSet { set, built_in, who } in sets {
                 let origin = match who {
@@ -249,7 +236,7 @@ async fn list(
                     None if *built_in => "ships with the car".to_owned(),
                     None => String::new(),
                 };
-                output::say(&format!(
+                output::print(&format!(
                     "{:<20} {:>3} values  {origin}",
                     set.name,
                     set.values.len()
@@ -262,7 +249,7 @@ async fn list(
     let (Some(of_a), Some(of_b)) = (find(&a), find(&b)) else {
         let unknown = if find(&a).is_none() { &a } else { &b };
         let known: Vec<_> = sets.iter().map(|stored| stored.set.name.as_str()).collect();
-        output::complain(&format!(
+        output::print_error(&format!(
             "{car}: no set {unknown}; there are {}",
             known.join(", ")
         ));
@@ -270,14 +257,14 @@ async fn list(
     };
     let differences = differences(of_a, of_b);
     if json {
-        output::say_json(&differences)?;
+        output::print_json(&differences)?;
     } else if differences.is_empty() {
-        output::say(&format!("{a} and {b} are the same"));
+        output::print(&format!("{a} and {b} are the same"));
     } else {
-        output::say(&format!("{:<32} {a:>16} {b:>16}", "parameter"));
+        output::print(&format!("{:<32} {a:>16} {b:>16}", "parameter"));
         let show = |value: &Option<Value>| value.as_ref().map_or("-".to_owned(), ToString::to_string);
         for (name, [a, b]) in &differences {
-            output::say(&format!("{name:<32} {:>16} {:>16}", show(a), show(b)));
+            output::print(&format!("{name:<32} {:>16} {:>16}", show(a), show(b)));
         }
     }
     Ok(ExitCode::SUCCESS)

@@ -5,59 +5,59 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
-use pitwall::{Hub, RecordingError, Summary};
+use pitwall::{FleetService, RecordingError, RecordingSummary};
 
 use super::{FIND, NO_SUCH_CAR, open, time_or_interrupt};
-use crate::cli::LinkOptions;
+use crate::cli::NetworkOptions;
 use crate::output;
 
 /// A recording that takes longer to end says why.
 const UNREMARKED: Duration = Duration::from_millis(600);
 
 pub(super) async fn record(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     file: &Path,
     time: Option<Duration>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    hub.start_recording(file).await?;
-    let waiting = hub.wait_until(FIND, |fleet| fleet.cars().any(|car| car.alive));
+    let service = open(network).await?;
+    service.start_recording(file).await?;
+    let waiting = service.wait_until(FIND, |fleet| fleet.cars().any(|car| car.alive));
     tokio::select! {
         found = waiting => if !found {
-            output::note("no car is on this link yet; whatever comes is recorded");
+            output::print_note("no car is on this link yet; whatever comes is recorded");
         },
         () = super::interrupted() => {}
     }
-    output::note(&format!(
+    output::print_note(&format!(
         "recording all cars into {}; Ctrl-C ends it",
         file.display()
     ));
     time_or_interrupt(time).await;
-    let summary = end(&hub).await.context("the recorder is gone")??;
-    hub.close().await;
+    let summary = end(&service).await.context("the recorder is gone")??;
+    service.close().await;
     if json {
-        output::say_json(&summary)?;
+        output::print_json(&summary)?;
     } else {
-        output::say(&summary.to_string());
+        output::print(&summary.to_string());
     }
     if summary.streams.is_empty() {
-        output::complain(&format!("no car was heard: {} is empty", file.display()));
+        output::print_error(&format!("no car was heard: {} is empty", file.display()));
         return Ok(ExitCode::from(NO_SUCH_CAR));
     }
     Ok(ExitCode::SUCCESS)
 }
 
 /// Ends the recording when all that the cars have sent is in it, or at once when the program is asked to stop once more.
-async fn end(hub: &Hub) -> Option<Result<Summary, RecordingError>> {
+async fn end(service: &FleetService) -> Option<Result<RecordingSummary, RecordingError>> {
     let patience = async {
         tokio::time::sleep(UNREMARKED).await;
-        output::note("waiting for what the cars have sent and has not come; Ctrl-C ends it as it is");
+        output::print_note("waiting for what the cars have sent and has not come; Ctrl-C ends it as it is");
         super::interrupted().await;
     };
     tokio::select! {
-        summary = hub.stop_recording() => summary,
-        () = patience => hub.cut_recording().await,
+        summary = service.stop_recording() => summary,
+        () = patience => service.cut_recording().await,
     }
 }
 
@@ -65,10 +65,10 @@ pub(super) fn recover(file: &Path, output: Option<PathBuf>, json: bool) -> anyho
     let to = output.unwrap_or_else(|| file.with_extension("recovered.mcap"));
     let recovered = pitwall::recover(file, &to)?;
     if json {
-        output::say_json(&recovered)?;
+        output::print_json(&recovered)?;
     } else {
         let damage = recovered.damage.as_deref().unwrap_or("the file was whole");
-        output::say(&format!(
+        output::print(&format!(
             "{}: {} messages over {:.1} s saved ({damage})",
             to.display(),
             recovered.messages,

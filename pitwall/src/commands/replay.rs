@@ -27,12 +27,12 @@ pub(super) async fn run(
         .await
         .map_err(|error| anyhow::anyhow!("cannot serve the page at {address}: {error}"))?;
     let duration = replay.view().duration_s;
-    super::complain_of(replay.unreadable());
+    super::print_unreadable(replay.unreadable());
     if json {
         let unreadable = replay.unreadable();
-        output::say_json(&json!({"page": page.url(), "duration_s": duration, "unreadable": unreadable}))?;
+        output::print_json(&json!({"page": page.url(), "duration_s": duration, "unreadable": unreadable}))?;
     } else {
-        output::say(&format!(
+        output::print(&format!(
             "replay of {}, {duration:.1} s: {}\nCtrl-C ends it",
             file.display(),
             page.url()

@@ -7,19 +7,20 @@ use anyhow::Context;
 use pitwall::{CarReport, Report};
 
 use crate::output;
+use crate::terminal::text;
 
 pub(super) fn run(file: &Path, output: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
     let report = Report::of(file)?;
     let to = output.unwrap_or_else(|| file.with_extension("html"));
     std::fs::write(&to, report.to_html()).with_context(|| to.display().to_string())?;
-    super::complain_of(&report.unreadable);
+    super::print_unreadable(&report.unreadable);
     if json {
-        output::say_json(&report)?;
+        output::print_json(&report)?;
     } else {
         for car in &report.cars {
-            output::say(&summary(car));
+            output::print(&summary(car));
         }
-        output::say(&format!("with figures: {}", to.display()));
+        output::print(&format!("with figures: {}", to.display()));
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -43,7 +44,7 @@ fn summary(car: &CarReport) -> String {
             row.laps,
             row.time_s.mean,
             row.time_s.sigma,
-            output::number(row.alignment.map(|a| a * 100.0), 1),
+            text::number(row.alignment.map(|a| a * 100.0), 1),
         ));
     }
     if let Some(truth) = &car.truth {
@@ -58,8 +59,8 @@ fn summary(car: &CarReport) -> String {
     }
     lines.push(format!(
         "  load     {} cores, update p99 at most {} ms; {} alarms, {} messages missing",
-        output::number(car.cpu, 2),
-        output::number(car.update_p99_ms, 2),
+        text::number(car.cpu, 2),
+        text::number(car.update_p99_ms, 2),
         car.alarms,
         car.missing,
     ));

@@ -17,16 +17,16 @@
 //! | `/<car>/{state,health,load,params}` | json | our own |
 //!
 //! The log time is the arrival by the laptop's clock, the publish time is the car's.
-mod file;
 mod foxglove;
 mod note;
-mod read;
+mod reader;
 mod recorder;
 mod recover;
 mod unreadable;
+mod writer;
 
-pub use file::{RecordingError, StreamSummary, Summary};
-pub use read::{Recording, read_events};
-pub use recorder::{Progress, Recorder, Status};
+pub use reader::{Recording, read_events};
+pub use recorder::{Recorder, RecorderStatus, RecordingProgress};
 pub use recover::{Recovered, recover};
 pub use unreadable::{Unreadable, UnreadableCount};
+pub use writer::{RecordingError, RecordingSummary, StreamSummary};

@@ -5,9 +5,9 @@ use std::sync::Arc;
 use protocol::{CarInfo, CarName, Header, Topic};
 use serde::{Deserialize, Serialize};
 
-use crate::event::Happening;
+use crate::event::EventPayload;
 
-/// A happening that no message carries.
+/// A payload that no message carries.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "note")]
 pub(super) enum Note {
@@ -51,31 +51,33 @@ impl Note {
             .ok()
     }
 
-    /// The note for a happening; None for those that are bytes of their own.
-    pub(super) fn of(happening: &Happening) -> Option<Self> {
-        Some(match happening {
-            Happening::Appeared => Self::Appeared,
-            Happening::Vanished => Self::Vanished,
-            Happening::Unreadable { topic, header, error } => Self::Unreadable {
+    /// The note for a payload; None for those that are bytes of their own.
+    pub(super) fn of(payload: &EventPayload) -> Option<Self> {
+        Some(match payload {
+            EventPayload::Appeared => Self::Appeared,
+            EventPayload::Vanished => Self::Vanished,
+            EventPayload::Unreadable { topic, header, error } => Self::Unreadable {
                 topic: *topic,
                 header: *header,
                 error: error.clone(),
             },
-            Happening::Info(info) => Self::Info { info: info.clone() },
-            Happening::Clock { offset, round_trip } => Self::Clock {
+            EventPayload::Info(info) => Self::Info { info: info.clone() },
+            EventPayload::Clock { offset, round_trip } => Self::Clock {
                 offset: *offset,
                 round_trip: *round_trip,
             },
-            Happening::Marker { who, text } => Self::Marker {
+            EventPayload::Marker { who, text } => Self::Marker {
                 who: who.to_string(),
                 text: text.to_string(),
             },
-            Happening::Message { .. } | Happening::Map { .. } | Happening::HowFar { .. } => return None,
+            EventPayload::Message { .. } | EventPayload::Map { .. } | EventPayload::StreamEnds { .. } => {
+                return None;
+            }
         })
     }
 }
 
-impl From<Note> for Happening {
+impl From<Note> for EventPayload {
     fn from(note: Note) -> Self {
         match note {
             Note::Appeared => Self::Appeared,

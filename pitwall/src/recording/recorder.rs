@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender};
 use serde::Serialize;
 
-use super::file::{RecordingError, RecordingFile, Summary};
+use super::writer::{RecordingError, RecordingSummary, RecordingWriter};
 use crate::event::FleetEvent;
 
 /// How often what was recorded goes to the operating system: a crash of the program loses no more than this.
@@ -23,27 +23,27 @@ const QUEUE: usize = 200_000;
 /// A recording in progress.
 pub struct Recorder {
     events: Sender<Arc<FleetEvent>>,
-    thread: JoinHandle<Result<Summary, RecordingError>>,
+    thread: JoinHandle<Result<RecordingSummary, RecordingError>>,
     path: PathBuf,
-    status: Arc<Mutex<Status>>,
+    status: Arc<Mutex<RecorderStatus>>,
 }
 
 /// How a recording is getting on.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Status {
+pub struct RecorderStatus {
     /// Bytes in the file.
     pub bytes: u64,
     /// Events that were not recorded because the disk was too slow.
     pub overrun: u64,
     /// What is in the file so far.
-    pub summary: Summary,
+    pub summary: RecordingSummary,
     /// Why recording has failed, if it has.
     pub error: Option<String>,
 }
 
 /// How a recording is getting on, in short.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Progress {
+pub struct RecordingProgress {
     /// Bytes in the file.
     pub bytes: u64,
     /// From the first event to the last [s].
@@ -68,9 +68,9 @@ impl Recorder {
             .map_err(|e| RecordingError::io(path, e))?;
         let sync = file.try_clone().map_err(|e| RecordingError::io(path, e))?;
         let recording =
-            RecordingFile::new(BufWriter::new(file)).map_err(|e| RecordingError::mcap(path, e))?;
+            RecordingWriter::new(BufWriter::new(file)).map_err(|e| RecordingError::mcap(path, e))?;
         let (events, queue) = crossbeam_channel::bounded(QUEUE);
-        let status = Arc::new(Mutex::new(Status::default()));
+        let status = Arc::new(Mutex::new(RecorderStatus::default()));
         let work = Work {
             path: path.to_owned(),
             recording,
@@ -91,7 +91,7 @@ impl Recorder {
     }
 
     /// Takes in an event; never waits.
-    pub fn take(&self, event: &Arc<FleetEvent>) {
+    pub fn record(&self, event: &Arc<FleetEvent>) {
         if self.events.try_send(event.clone()).is_err() {
             self.status.lock().unwrap_or_else(PoisonError::into_inner).overrun += 1;
         }
@@ -103,14 +103,14 @@ impl Recorder {
     }
 
     /// How it is getting on.
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> RecorderStatus {
         self.status.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     /// How it is getting on, in short: cheap enough to be asked for many times a second.
-    pub fn progress(&self) -> Progress {
+    pub fn progress(&self) -> RecordingProgress {
         let status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
-        Progress {
+        RecordingProgress {
             bytes: status.bytes,
             seconds: status.summary.duration_s,
             messages: status.summary.messages,
@@ -121,7 +121,7 @@ impl Recorder {
     }
 
     /// Writes what is left, ends the file and says what is in it. Waits for the disk.
-    pub fn finish(self) -> Result<Summary, RecordingError> {
+    pub fn finish(self) -> Result<RecordingSummary, RecordingError> {
         drop(self.events);
         self.thread.join().unwrap_or_else(|_| {
             let gone = std::io::Error::other("the recorder's thread panicked");
@@ -132,14 +132,14 @@ impl Recorder {
 
 struct Work {
     path: PathBuf,
-    recording: RecordingFile<BufWriter<File>>,
+    recording: RecordingWriter<BufWriter<File>>,
     sync: File,
     queue: Receiver<Arc<FleetEvent>>,
-    status: Arc<Mutex<Status>>,
+    status: Arc<Mutex<RecorderStatus>>,
 }
 
 impl Work {
-    fn run(self) -> Result<Summary, RecordingError> {
+    fn run(self) -> Result<RecordingSummary, RecordingError> {
         let status = self.status.clone();
         let outcome = self.record();
         if let Err(error) = &outcome {
@@ -149,7 +149,7 @@ impl Work {
         outcome
     }
 
-    fn record(mut self) -> Result<Summary, RecordingError> {
+    fn record(mut self) -> Result<RecordingSummary, RecordingError> {
         let path = self.path.clone();
         let io = |e| RecordingError::io(&path, e);
         let mcap = |e| RecordingError::mcap(&path, e);

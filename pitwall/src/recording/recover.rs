@@ -9,8 +9,8 @@ use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
 use serde::Serialize;
 
-use super::file::RecordingError;
-use super::read::open;
+use super::reader::open;
+use super::writer::RecordingError;
 
 /// What could be saved.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -6,7 +6,7 @@ use std::fmt;
 use protocol::{CarName, Topic};
 use serde::Serialize;
 
-use crate::event::{FleetEvent, Happening};
+use crate::event::{EventPayload, FleetEvent};
 
 /// Messages of one stream that cannot be read.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -47,7 +47,7 @@ pub struct UnreadableCount(BTreeMap<(CarName, Topic), (u64, String)>);
 impl UnreadableCount {
     /// Takes note of an event.
     pub fn take(&mut self, event: &FleetEvent) {
-        if let Happening::Unreadable { topic, error, .. } = &event.happening {
+        if let EventPayload::Unreadable { topic, error, .. } = &event.payload {
             let (messages, _) = self
                 .0
                 .entry((event.car.clone(), *topic))
@@ -71,8 +71,8 @@ impl UnreadableCount {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::recording::file::RecordingFile;
-    use crate::{Lane, Replay, Report, read_events};
+    use crate::recording::writer::RecordingWriter;
+    use crate::{Delivery, Replay, Report, read_events};
     use protocol::{Event, EventKind, Stamps, Telemetry, encode};
     use std::sync::Arc;
 
@@ -95,9 +95,9 @@ mod tests {
         FleetEvent {
             at: 1_000_000_000 + number as i64,
             car: "car-1".parse().expect("a name"),
-            happening: Happening::Message {
+            payload: EventPayload::Message {
                 topic: Topic::Event,
-                lane: Lane::Complete,
+                delivery: Delivery::InOrder,
                 header,
                 telemetry: Box::new(Telemetry::Event(event)),
                 bytes: bytes.into(),
@@ -110,14 +110,14 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("session.mcap");
         let file = std::fs::File::create(&path).expect("a file");
-        let mut recording = RecordingFile::new(file).expect("begun");
+        let mut recording = RecordingWriter::new(file).expect("begun");
         for (number, version) in [(1, 1), (2, 99), (3, 2), (4, 99), (5, 3)] {
             recording.write(&event(number, version)).expect("written");
         }
         // One that the pit wall that recorded could not read either.
         let mut unread = event(6, 1);
-        if let Happening::Message { topic, header, .. } = unread.happening {
-            unread.happening = Happening::Unreadable {
+        if let EventPayload::Message { topic, header, .. } = unread.payload {
+            unread.payload = EventPayload::Unreadable {
                 topic,
                 header: Some(header),
                 error: "damaged".into(),
@@ -129,7 +129,7 @@ mod tests {
 
         let read: Vec<_> = read_events(&path)
             .expect("opens")
-            .map(|event| matches!(event.expect("goes on").happening, Happening::Message { .. }))
+            .map(|event| matches!(event.expect("goes on").payload, EventPayload::Message { .. }))
             .collect();
         assert_eq!(read, [true, false, true, false, true, false, true]);
         let report = Report::of(&path).expect("a report");

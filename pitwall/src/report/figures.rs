@@ -104,9 +104,9 @@ fn over_lap(
     worst: &dyn Fn(f64, f64) -> f64,
     draw: impl FnOnce(Vec<[f64; 2]>, Vec<[f64; 2]>) -> String,
 ) -> Option<String> {
-    let mut places = vec![(0.0, 0_u32, f64::NAN); PLACES];
+    let mut cells = vec![(0.0, 0_u32, f64::NAN); PLACES];
     for (s, value) in values {
-        let (sum, count, extreme) = &mut places[place_of(s, length)];
+        let (sum, count, extreme) = &mut cells[place_of(s, length)];
         *sum += value;
         *count += 1;
         // NaN gives way to any number.
@@ -115,10 +115,10 @@ fn over_lap(
     let at = |i: usize| (i as f64 + 0.5) / PLACES as f64 * length;
     let mean = |(i, (sum, count, _)): (usize, &(f64, u32, f64))| [at(i), sum / f64::from(*count)];
     let extreme = |(i, (_, _, extreme)): (usize, &(f64, u32, f64))| [at(i), *extreme];
-    places.iter().any(|(_, count, _)| *count > 0).then(|| {
+    cells.iter().any(|(_, count, _)| *count > 0).then(|| {
         draw(
-            places.iter().enumerate().map(mean).collect(),
-            places.iter().enumerate().map(extreme).collect(),
+            cells.iter().enumerate().map(mean).collect(),
+            cells.iter().enumerate().map(extreme).collect(),
         )
     })
 }

@@ -2,7 +2,7 @@
 
 use super::svg::escape;
 use super::{CarReport, MeanSigma, Report, figures};
-use crate::laps::SECTORS;
+use crate::fleet::SECTORS;
 
 const STYLE: &str = "
 :root { color-scheme: light dark; --text: light-dark(#131a22, #e8edf3); --quiet: light-dark(#505b68, #9aa7b6);
@@ -131,7 +131,7 @@ fn section(car: &CarReport, duration_s: f64) -> String {
 }
 
 fn laps(car: &CarReport) -> String {
-    let least = |value: &dyn Fn(&crate::laps::Lap) -> Option<f64>| {
+    let least = |value: &dyn Fn(&crate::fleet::Lap) -> Option<f64>| {
         car.laps.iter().filter_map(value).min_by(f64::total_cmp)
     };
     let best = least(&|lap| Some(lap.time_s));

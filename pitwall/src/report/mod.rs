@@ -16,9 +16,9 @@ use std::path::Path;
 use protocol::{CarName, MapReply, Pose2, State, Telemetry, Topic};
 use serde::Serialize;
 
-use crate::event::{FleetEvent, Happening};
+use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
-use crate::laps::Lap;
+use crate::fleet::Lap;
 use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
 /// Everything that the report says.
@@ -118,7 +118,7 @@ struct Series {
 struct Spot {
     sensor: i64,
     pose: Pose2,
-    /// Place along and off the raceline [m].
+    /// ProfileCell along and off the raceline [m].
     track: Option<[f64; 2]>,
 }
 
@@ -192,12 +192,12 @@ impl Collector {
         self.unreadable.take(event);
         let at_s = (event.at - from) as f64 * 1e-9;
         let series = self.series.entry(event.car.clone()).or_default();
-        let Happening::Message {
+        let EventPayload::Message {
             topic,
             header,
             telemetry,
             ..
-        } = &event.happening
+        } = &event.payload
         else {
             return;
         };
@@ -384,7 +384,7 @@ fn true_error(poses: &[Spot], truths: &[(i64, Pose2)]) -> Option<TrueError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::laps::LapGrip;
+    use crate::fleet::LapGrip;
 
     fn lap(lap: u32, time_s: f64, set: &str) -> Lap {
         Lap {

@@ -9,12 +9,12 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::App;
-use crate::ask::{PATIENCE, new_command_id};
-use crate::link::unix_now;
+use crate::clock::unix_now;
+use crate::network::{REPLY_TIMEOUT, new_command_id};
 
 /// The map of a car.
 pub(super) async fn map(State(app): State<App>, Path(car): Path<CarName>) -> Response {
-    let map = app.board.fleet().car(&car).and_then(|car| car.map.clone());
+    let map = app.bus.fleet().car(&car).and_then(|car| car.map.clone());
     match map {
         Some((map, _)) => Json(&*map).into_response(),
         None => (StatusCode::NOT_FOUND, format!("no map of {car} yet")).into_response(),
@@ -47,8 +47,10 @@ pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandR
         expected_revision,
         action,
     };
-    let Some(hub) = &app.hub else { return in_a_replay() };
-    match hub.link().send(&car, &command, PATIENCE).await {
+    let Some(service) = &app.service else {
+        return in_a_replay();
+    };
+    match service.client().send(&car, &command, REPLY_TIMEOUT).await {
         Ok(verdict) => Json(json!({
             "id": command.id,
             "done": verdict.exit_code() == 0,
@@ -70,13 +72,15 @@ pub(super) struct RecordRequest {
 /// Begins or ends a recording, in a file named by the time.
 pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordRequest>) -> Response {
     let RecordRequest { on, operator } = request;
-    let Some(hub) = &app.hub else { return in_a_replay() };
+    let Some(service) = &app.service else {
+        return in_a_replay();
+    };
     if operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
     let say = |severity, text: String| {
         let who = Some(operator.clone());
-        app.board
+        app.bus
             .fleet()
             .say(unix_now(), None, severity, "recorder", text, who);
     };
@@ -84,7 +88,7 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
         let file = app
             .recordings
             .join(format!("session-{}.mcap", unix_now() / 1_000_000_000));
-        match hub.start_recording(&file).await {
+        match service.start_recording(&file).await {
             Ok(()) => {
                 say(Severity::Info, format!("recording into {}", file.display()));
                 Json(json!({"recording": file.display().to_string()})).into_response()
@@ -93,8 +97,8 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
         }
     } else {
         // It goes on when whoever asked does not wait for it.
-        let hub = hub.clone();
-        let ended = tokio::spawn(async move { hub.stop_recording().await });
+        let service = service.clone();
+        let ended = tokio::spawn(async move { service.stop_recording().await });
         match ended.await.ok().flatten() {
             Some(Ok(summary)) => {
                 let (messages, missing) = (summary.messages, summary.missing());
@@ -130,14 +134,16 @@ pub(super) struct MarkRequest {
 pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest>) -> Response {
     const LONGEST: usize = 500;
     let MarkRequest { car, operator, text } = request;
-    let Some(hub) = &app.hub else { return in_a_replay() };
+    let Some(service) = &app.service else {
+        return in_a_replay();
+    };
     if text.len() > LONGEST || operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
-    if app.board.fleet().car(&car).is_none() {
+    if app.bus.fleet().car(&car).is_none() {
         return (StatusCode::NOT_FOUND, format!("no such car: {car}")).into_response();
     }
-    hub.mark(&car, &operator, &text);
+    service.mark(&car, &operator, &text);
     StatusCode::NO_CONTENT.into_response()
 }
 
@@ -152,7 +158,7 @@ pub(super) async fn acknowledge(State(app): State<App>, Json(request): Json<Ackn
     if request.operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
-    app.board.fleet().acknowledge(app.now(), &request.operator);
+    app.bus.fleet().acknowledge(app.now(), &request.operator);
     StatusCode::NO_CONTENT.into_response()
 }
 

@@ -38,9 +38,9 @@ use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use crate::board::Board;
-use crate::hub::Hub;
-use crate::link::unix_now;
+use crate::clock::unix_now;
+use crate::event_bus::EventBus;
+use crate::fleet_service::FleetService;
 use crate::replay::Replay;
 use guard::Guard;
 use present::Present;
@@ -73,9 +73,9 @@ pub struct Page {
 /// What every request may need.
 #[derive(Clone)]
 struct App {
-    board: Arc<Board>,
+    bus: Arc<EventBus>,
     /// The way to the cars; None in a replay.
-    hub: Option<Arc<Hub>>,
+    service: Option<Arc<FleetService>>,
     /// None when live.
     replay: Option<Arc<Replay>>,
     recordings: Arc<PathBuf>,
@@ -105,18 +105,18 @@ impl App {
 
 impl Page {
     /// Binds the address and serves until [`Page::stop`].
-    pub async fn serve(hub: Arc<Hub>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(hub.board().clone(), Some(hub), None, options).await
+    pub async fn serve(service: Arc<FleetService>, options: PageOptions) -> std::io::Result<Self> {
+        Self::serve_from(service.bus().clone(), Some(service), None, options).await
     }
 
     /// Serves a recording in place of cars.
     pub async fn serve_replay(replay: Arc<Replay>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(replay.board().clone(), None, Some(replay), options).await
+        Self::serve_from(replay.bus().clone(), None, Some(replay), options).await
     }
 
     async fn serve_from(
-        board: Arc<Board>,
-        hub: Option<Arc<Hub>>,
+        bus: Arc<EventBus>,
+        service: Option<Arc<FleetService>>,
         replay: Option<Arc<Replay>>,
         options: PageOptions,
     ) -> std::io::Result<Self> {
@@ -126,17 +126,17 @@ impl Page {
         let url = guard.url(address);
         let (stop, stopping) = watch::channel(false);
         let (room, disk_free) = watch::channel(None);
-        if hub.is_some() {
+        if service.is_some() {
             tokio::spawn(look_at_disk(
-                board.clone(),
+                bus.clone(),
                 options.recordings.clone(),
                 room,
                 stopping.clone(),
             ));
         }
         let app = App {
-            board,
-            hub,
+            bus,
+            service,
             replay,
             recordings: Arc::new(options.recordings),
             disk_free,
@@ -188,7 +188,7 @@ impl Page {
 
 /// Takes the room on the disk every few seconds, and says so when it runs short during a recording.
 async fn look_at_disk(
-    board: Arc<Board>,
+    bus: Arc<EventBus>,
     folder: PathBuf,
     room: watch::Sender<Option<u64>>,
     mut stopping: watch::Receiver<bool>,
@@ -206,11 +206,10 @@ async fn look_at_disk(
             return;
         };
         room.send_replace(free);
-        let scarce = board.recording().is_some() && free.is_some_and(|free| free < disk::SCARCE);
+        let scarce = bus.recording().is_some() && free.is_some_and(|free| free < disk::SCARCE);
         if scarce && !said {
             let text = format!("{:.1} GB left for the recording", free.unwrap_or(0) as f64 / 1e9);
-            board
-                .fleet()
+            bus.fleet()
                 .say(unix_now(), None, Severity::Critical, "disk", text, None);
         }
         said = scarce;
@@ -237,7 +236,7 @@ fn files() -> Router<App> {
         .route("/chart.js", file(include_str!("page/chart.js"), script))
         .route("/large.js", file(include_str!("page/large.js"), script))
         .route("/lists.js", file(include_str!("page/lists.js"), script))
-        .route("/link.js", file(include_str!("page/link.js"), script))
+        .route("/connection.js", file(include_str!("page/connection.js"), script))
         .route("/sound.js", file(include_str!("page/sound.js"), script))
         .route("/track.js", file(include_str!("page/track.js"), script))
         .route("/icon.svg", file(include_str!("page/icon.svg"), "image/svg+xml"))

@@ -11,7 +11,7 @@ use re_web_viewer_server::WebViewerData;
 use serde_json::json;
 
 use super::App;
-use crate::rerun_view::{RerunOutlet, RerunView};
+use crate::rerun::{RerunOutlet, RerunView};
 
 /// The data's server, once it runs.
 pub(super) struct Pane {
@@ -28,7 +28,7 @@ pub(super) async fn open(State(app): State<App>) -> Response {
     let mut pane = app.pane.lock().await;
     if pane.is_none() {
         let started = free_port().map_err(|error| error.to_string()).and_then(|port| {
-            let view = RerunView::start(app.board.tap(app.now()), &RerunOutlet::Serve(port))
+            let view = RerunView::start(app.bus.subscribe(app.now()), &RerunOutlet::Serve(port))
                 .map_err(|e| e.to_string())?;
             Ok(Pane { _view: view, port })
         });

@@ -12,11 +12,11 @@ use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 
 use super::App;
-use crate::car::{Car, CarView};
-use crate::history::{Moment, Place};
-use crate::laps::Lap;
-use crate::log::LogEntry;
-use crate::recording::Progress;
+use crate::fleet::Lap;
+use crate::fleet::LogEntry;
+use crate::fleet::{Car, CarView};
+use crate::fleet::{HealthSample, ProfileCell};
+use crate::recording::RecordingProgress;
 use crate::replay::ReplayView;
 
 /// Snapshots per second.
@@ -68,14 +68,14 @@ struct Hello {
     /// True when the Rerun viewer is built in.
     rerun: bool,
     /// The last two minutes of each car.
-    history: BTreeMap<CarName, Vec<Moment>>,
+    history: BTreeMap<CarName, Vec<HealthSample>>,
 }
 
 #[derive(Serialize)]
 struct RecordingView {
     file: String,
     #[serde(flatten)]
-    progress: Progress,
+    progress: RecordingProgress,
 }
 
 #[derive(Serialize)]
@@ -90,7 +90,7 @@ struct Selected {
     laps: Option<Vec<Lap>>,
     /// Health along the lap; None when it is as it was.
     #[serde(skip_serializing_if = "Option::is_none")]
-    strip: Option<Vec<Option<Place>>>,
+    health_profile: Option<Vec<Option<ProfileCell>>>,
 }
 
 /// What a page says.
@@ -134,7 +134,7 @@ struct Seen {
 impl Seen {
     fn nothing(app: &App) -> Self {
         Self {
-            log: app.board.fleet().log().last().saturating_sub(HISTORY),
+            log: app.bus.fleet().log().last().saturating_sub(HISTORY),
             ..Self::default()
         }
     }
@@ -177,7 +177,7 @@ impl Seen {
                 })
                 .collect(),
             laps: (laps_known != Some(count)).then(|| car.laps().to_vec()),
-            strip: paint.then(|| car.strip().to_vec()),
+            health_profile: paint.then(|| car.health_profile().to_vec()),
         }
     }
 }
@@ -186,7 +186,7 @@ impl Snapshot {
     /// The cars now, and what happened since the page was told last.
     fn take(app: &App, selected: Option<&CarName>, seen: &mut Seen) -> Self {
         let now = app.now();
-        let fleet = app.board.fleet();
+        let fleet = app.bus.fleet();
         let epoch = fleet.epoch();
         let anew = seen.epoch.replace(epoch) != Some(epoch);
         if anew {
@@ -218,12 +218,12 @@ impl Snapshot {
         drop(fleet);
         Self {
             now,
-            made: crate::link::unix_now(),
+            made: crate::clock::unix_now(),
             number: seen.number,
             epoch,
             cars,
             maps,
-            recording: app.board.recording().map(|(file, progress)| RecordingView {
+            recording: app.bus.recording().map(|(file, progress)| RecordingView {
                 file: file.display().to_string(),
                 progress,
             }),

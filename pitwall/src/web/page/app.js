@@ -1,6 +1,6 @@
 // Puts the page together: snapshots to views, buttons and keys to commands.
 
-import { command, connect, post } from "/link.js";
+import { command, connect, post } from "/connection.js";
 import { Cards, STATES, element, fixed, lasting, otherSet } from "/cards.js";
 import { Large } from "/large.js";
 import { Track, palette } from "/track.js";

@@ -49,7 +49,7 @@ export class Track {
     this.drag = null;
     this.candidates = [];
     this.paint = "off";
-    this.strips = new Map();
+    this.profiles = new Map();
     this.size = "";
     this.snapshot = null;
     this.selected = null;
@@ -78,7 +78,7 @@ export class Track {
       }
     }
     const { selected: details } = snapshot;
-    if (details?.strip) this.strips.set(details.car, details.strip);
+    if (details?.health_profile) this.profiles.set(details.car, details.health_profile);
     for (const car of snapshot.maps) {
       if (!this.maps.has(car) && !this.fetching.has(car)) this.fetchMap(car);
     }
@@ -91,7 +91,7 @@ export class Track {
   /// Another epoch: what was known is void, but for the maps.
   restart() {
     this.trails.clear();
-    this.strips.clear();
+    this.profiles.clear();
     this.candidates = [];
   }
 
@@ -284,15 +284,15 @@ export class Track {
 
   /// The selected car's lap, place by place, as it was the last time it was there.
   drawStrip(context, map, pixel, colour) {
-    const strip = this.strips.get(this.selected);
+    const profile = this.profiles.get(this.selected);
     const line = map.raceline?.points ?? [];
-    if (!strip?.length || line.length < 3) return;
+    if (!profile?.length || line.length < 3) return;
     const [colourOfPlace] = PAINTS[this.paint];
     const width = Math.max(0.2, 5 * pixel);
     context.globalAlpha = 0.7;
-    strip.forEach((place, i) => {
+    profile.forEach((place, i) => {
       if (!place) return;
-      const [from, to] = [i, i + 1].map((k) => Math.round(k / strip.length * line.length));
+      const [from, to] = [i, i + 1].map((k) => Math.round(k / profile.length * line.length));
       const name = colourOfPlace(place);
       context.strokeStyle = colour[name];
       context.lineWidth = width * (WIDTHS[name] ?? 1);

@@ -20,7 +20,7 @@ use std::collections::BTreeMap;
 
 use protocol::{CarName, Kept, MissingRequest, Topic, Wanted};
 
-use crate::event::Sent;
+use crate::event::SentRange;
 
 /// Messages of a stream that are asked for when its sender is found; of events all.
 const HISTORY: u64 = 100;
@@ -33,18 +33,18 @@ const AGAIN: i64 = SECOND / 3;
 /// A message that was sent is on its way for so long before it counts as missing [ns].
 const ON_ITS_WAY: i64 = SECOND;
 /// Both when a recording is about to end [ns].
-const LAST_CALL: i64 = SECOND / 10;
+const FINAL_SYNC: i64 = SECOND / 10;
 /// Bounds of what an answer may hold [bytes], and the round trip between which it grows and shrinks [ns].
 const BUDGET: [u32; 2] = [4_000, 48_000];
 const ROUND_TRIP: [i64; 2] = [SECOND / 20, SECOND / 5];
 /// A stream with more gaps than this gives up the oldest: they stay missing.
-const MOST_HOLES: usize = 4096;
+const MAX_GAPS: usize = 4096;
 
 const SECOND: i64 = 1_000_000_000;
 
-/// A number in a stream of a car's run.
+/// A number in a stream of a car's run_id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Place {
+pub(crate) struct MessageId {
     /// The stream.
     pub(crate) topic: Topic,
     /// See [`protocol::Header`].
@@ -55,7 +55,7 @@ pub(crate) struct Place {
 
 /// A question to put to a car.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Question {
+pub(crate) struct MissingQuery {
     /// The car.
     pub(crate) car: CarName,
     /// What to ask.
@@ -66,13 +66,13 @@ pub(crate) struct Question {
 
 /// The streams of all cars. `T` is a message.
 #[derive(Debug)]
-pub(crate) struct CatchUp<T> {
+pub(crate) struct GapRecovery<T> {
     cars: BTreeMap<CarName, Car<T>>,
     /// The full-rate streams are wanted, too.
     recorded: bool,
 }
 
-impl<T> Default for CatchUp<T> {
+impl<T> Default for GapRecovery<T> {
     fn default() -> Self {
         Self {
             cars: BTreeMap::new(),
@@ -90,16 +90,16 @@ struct Car<T> {
     /// When to ask next [unix ns].
     due: i64,
     budget: u32,
-    last_call: Option<LastCall>,
+    final_sync: Option<FinalSync>,
 }
 
 /// How a car stands with a last call.
 #[derive(Debug)]
-enum LastCall {
+enum FinalSync {
     /// It was made at this time, and is not answered yet [unix ns].
     Made(i64),
-    /// The car's run id, and the last number of each stream.
-    Answered(u64, Vec<Sent>),
+    /// The car's run_id, and the last number of each stream.
+    Answered(u64, Vec<SentRange>),
     /// Nobody answered.
     Silent,
 }
@@ -115,7 +115,7 @@ pub(crate) struct Outstanding {
 
 impl Outstanding {
     /// Nothing is known yet.
-    pub(crate) const MOST: Self = Self {
+    pub(crate) const UNKNOWN: Self = Self {
         cars: u64::MAX,
         messages: u64::MAX,
     };
@@ -131,12 +131,12 @@ impl<T> Default for Car<T> {
             asked: None,
             due: 0,
             budget: BUDGET[0],
-            last_call: None,
+            final_sync: None,
         }
     }
 }
 
-impl<T> CatchUp<T> {
+impl<T> GapRecovery<T> {
     /// Takes note of a car: it is asked what it has.
     pub(crate) fn appeared(&mut self, car: &CarName) {
         self.cars.entry(car.clone()).or_default().due = 0;
@@ -148,7 +148,7 @@ impl<T> CatchUp<T> {
         let mut out = Vec::new();
         for car in self.cars.values_mut() {
             car.due = 0;
-            car.last_call = None;
+            car.final_sync = None;
             if !on {
                 let streams = car.streams.values_mut();
                 let held = streams.flat_map(|stream| std::mem::take(&mut stream.held).into_values());
@@ -160,9 +160,9 @@ impl<T> CatchUp<T> {
     }
 
     /// Asks every car at `now` [unix ns] how far its streams go, and for all that it has sent by then.
-    pub(crate) fn last_call(&mut self, now: i64) {
+    pub(crate) fn final_sync(&mut self, now: i64) {
         for car in self.cars.values_mut() {
-            car.last_call = Some(LastCall::Made(now));
+            car.final_sync = Some(FinalSync::Made(now));
             car.due = 0;
         }
     }
@@ -171,22 +171,22 @@ impl<T> CatchUp<T> {
     pub(crate) fn outstanding(&self) -> Outstanding {
         let mut outstanding = Outstanding::NOTHING;
         for car in self.cars.values() {
-            match &car.last_call {
-                Some(LastCall::Made(_)) => outstanding.cars += 1,
-                Some(LastCall::Answered(..)) => outstanding.messages += car.outstanding(),
-                Some(LastCall::Silent) | None => {}
+            match &car.final_sync {
+                Some(FinalSync::Made(_)) => outstanding.cars += 1,
+                Some(FinalSync::Answered(..)) => outstanding.messages += car.outstanding(),
+                Some(FinalSync::Silent) | None => {}
             }
         }
         outstanding
     }
 
     /// Takes in a message that came at `at` [unix ns]. Returns what can be handed on now, in order.
-    pub(crate) fn arrive(&mut self, car: &CarName, place: Place, message: T, at: i64) -> Vec<T> {
-        let Place {
+    pub(crate) fn arrive(&mut self, car: &CarName, id: MessageId, message: T, at: i64) -> Vec<T> {
+        let MessageId {
             topic,
             run_id,
             number,
-        } = place;
+        } = id;
         let car = self.cars.entry(car.clone()).or_default();
         let mut out = car.follow(run_id);
         if number == 0 || car.run_id.is_some_and(|known| run_id < known) {
@@ -214,7 +214,7 @@ impl<T> CatchUp<T> {
     }
 
     /// The questions that are to be put at `now` [unix ns].
-    pub(crate) fn due(&mut self, now: i64) -> Vec<Question> {
+    pub(crate) fn due(&mut self, now: i64) -> Vec<MissingQuery> {
         let recorded = self.recorded;
         let asked = self.cars.iter_mut().filter_map(|(name, car)| {
             if car.asked.is_some() || now < car.due {
@@ -246,7 +246,7 @@ impl<T> CatchUp<T> {
                 streams,
                 budget: car.budget,
             };
-            Some(Question {
+            Some(MissingQuery {
                 car: name.clone(),
                 request,
                 urgent,
@@ -264,11 +264,11 @@ impl<T> CatchUp<T> {
         kept: &[Kept],
         more: bool,
         now: i64,
-    ) -> (Vec<T>, Option<Vec<Sent>>) {
+    ) -> (Vec<T>, Option<Vec<SentRange>>) {
         let recorded = self.recorded;
         let car = self.cars.entry(car.clone()).or_default();
         let mut out = car.follow(run_id);
-        let answers_last_call = car.answers_last_call();
+        let answers_final_sync = car.answers_final_sync();
         if let Some(asked) = car.asked.take() {
             let [least, most] = BUDGET;
             let [short, long] = ROUND_TRIP;
@@ -278,7 +278,7 @@ impl<T> CatchUp<T> {
                 _ => car.budget,
             };
         }
-        let on_its_way = car.last_call.as_ref().map_or(ON_ITS_WAY, |_| LAST_CALL);
+        let on_its_way = car.final_sync.as_ref().map_or(ON_ITS_WAY, |_| FINAL_SYNC);
         let mut sent = Vec::new();
         for kept in kept {
             if !kept.topic.recovered() || kept.topic.recorded() && !recorded {
@@ -291,32 +291,32 @@ impl<T> CatchUp<T> {
             stream.kept(*kept, now, on_its_way, &mut out);
             let (topic, from, to) = (kept.topic, stream.next(), kept.last);
             if from <= to {
-                sent.push(Sent { topic, from, to });
+                sent.push(SentRange { topic, from, to });
             }
         }
-        if answers_last_call {
-            car.last_call = Some(LastCall::Answered(run_id, sent.clone()));
+        if answers_final_sync {
+            car.final_sync = Some(FinalSync::Answered(run_id, sent.clone()));
         }
-        let missing = car.streams.values().any(|stream| !stream.holes.is_empty());
-        car.due = match (missing, more, &car.last_call) {
-            (true, true, _) | (_, _, Some(LastCall::Made(_))) => now,
-            (_, _, Some(LastCall::Answered(..))) if car.outstanding() > 0 => now + LAST_CALL,
+        let missing = car.streams.values().any(|stream| !stream.gaps.is_empty());
+        car.due = match (missing, more, &car.final_sync) {
+            (true, true, _) | (_, _, Some(FinalSync::Made(_))) => now,
+            (_, _, Some(FinalSync::Answered(..))) if car.outstanding() > 0 => now + FINAL_SYNC,
             (true, false, _) => now + AGAIN,
             (false, _, _) => now + POLL,
         };
-        (out, answers_last_call.then_some(sent))
+        (out, answers_final_sync.then_some(sent))
     }
 
     /// Nobody has answered by `now` [unix ns].
     pub(crate) fn unanswered(&mut self, car: &CarName, now: i64) {
         let car = self.cars.entry(car.clone()).or_default();
-        if car.answers_last_call() {
-            car.last_call = Some(LastCall::Silent);
+        if car.answers_final_sync() {
+            car.final_sync = Some(FinalSync::Silent);
         }
         car.asked = None;
         car.budget = BUDGET[0];
-        car.due = match car.last_call {
-            Some(LastCall::Made(_)) => now,
+        car.due = match car.final_sync {
+            Some(FinalSync::Made(_)) => now,
             _ => now + AGAIN,
         };
     }
@@ -343,13 +343,13 @@ impl<T> Car<T> {
     }
 
     /// True when the question on its way was put after a last call, which nobody has answered yet.
-    fn answers_last_call(&self) -> bool {
-        matches!((&self.last_call, self.asked), (Some(LastCall::Made(at)), Some(asked)) if asked >= *at)
+    fn answers_final_sync(&self) -> bool {
+        matches!((&self.final_sync, self.asked), (Some(FinalSync::Made(at)), Some(asked)) if asked >= *at)
     }
 
     /// Messages to come of those that the car had sent when it answered the last call.
     fn outstanding(&self) -> u64 {
-        let Some(LastCall::Answered(run_id, sent)) = &self.last_call else {
+        let Some(FinalSync::Answered(run_id, sent)) = &self.final_sync else {
             return 0;
         };
         let streams = sent.iter().filter(|_| self.run_id == Some(*run_id));
@@ -366,10 +366,10 @@ struct Stream<T> {
     /// The highest number that has come or is known to be missing.
     highest: u64,
     /// Missing ranges as `[from, to]`, ascending, and since when [unix ns].
-    holes: Vec<([u64; 2], i64)>,
+    gaps: Vec<([u64; 2], i64)>,
     /// A number that the car has sent, and since when that is known [unix ns].
     tail: Option<(u64, i64)>,
-    /// What came after a hole, and when [unix ns].
+    /// What came after a gap, and when [unix ns].
     held: BTreeMap<u64, (i64, T)>,
 }
 
@@ -378,7 +378,7 @@ impl<T> Stream<T> {
         Self {
             begun,
             highest: 0,
-            holes: Vec::new(),
+            gaps: Vec::new(),
             tail: None,
             held: BTreeMap::new(),
         }
@@ -386,7 +386,7 @@ impl<T> Stream<T> {
 
     fn arrive(&mut self, topic: Topic, number: u64, message: T, at: i64, out: &mut Vec<T>) {
         if self.begun && number <= self.highest {
-            // It fills a hole, or has come already.
+            // It fills a gap, or has come already.
             if !self.fill(number) {
                 return;
             }
@@ -426,7 +426,7 @@ impl<T> Stream<T> {
             }
         }
         // What the car no longer has is lost.
-        self.holes.retain_mut(|([from, to], _)| {
+        self.gaps.retain_mut(|([from, to], _)| {
             *from = first.max(*from);
             from <= to
         });
@@ -442,12 +442,12 @@ impl<T> Stream<T> {
         self.release(out);
     }
 
-    /// Hands on what no hole precedes.
+    /// Hands on what no gap precedes.
     fn release(&mut self, out: &mut Vec<T>) {
         if !self.begun {
             return;
         }
-        let first_hole = self.holes.first().map_or(u64::MAX, |([from, _], _)| *from);
+        let first_hole = self.gaps.first().map_or(u64::MAX, |([from, _], _)| *from);
         while let Some(next) = self.held.first_entry()
             && *next.key() < first_hole
         {
@@ -456,54 +456,54 @@ impl<T> Stream<T> {
     }
 
     fn miss(&mut self, range: [u64; 2], at: i64) {
-        if self.holes.len() == MOST_HOLES {
-            self.holes.remove(0);
+        if self.gaps.len() == MAX_GAPS {
+            self.gaps.remove(0);
         }
-        self.holes.push((range, at));
+        self.gaps.push((range, at));
     }
 
     /// Takes a number out of the missing ones; false when it was none of them.
     fn fill(&mut self, number: u64) -> bool {
         let within = |([from, to], _): &([u64; 2], i64)| (*from..=*to).contains(&number);
-        let Some(index) = self.holes.iter().position(within) else {
+        let Some(index) = self.gaps.iter().position(within) else {
             return false;
         };
-        let ([from, to], since) = self.holes.remove(index);
+        let ([from, to], since) = self.gaps.remove(index);
         if number < to {
-            self.holes.insert(index, ([number + 1, to], since));
+            self.gaps.insert(index, ([number + 1, to], since));
         }
         if number > from {
-            self.holes.insert(index, ([from, number - 1], since));
+            self.gaps.insert(index, ([from, number - 1], since));
         }
         true
     }
 
     /// The first number that has not been handed on.
     fn next(&self) -> u64 {
-        let hole = self.holes.first().map(|([from, _], _)| *from);
+        let gap = self.gaps.first().map(|([from, _], _)| *from);
         let held = self.held.keys().next().copied();
-        let next = hole.into_iter().chain(held).min();
+        let next = gap.into_iter().chain(held).min();
         next.unwrap_or(self.highest + 1)
     }
 
     /// How many numbers up to `last` have not come.
     fn lacks_up_to(&self, last: u64) -> u64 {
-        let holes = self
-            .holes
+        let gaps = self
+            .gaps
             .iter()
             .map(|([from, to], _)| (*to.min(&last) + 1).saturating_sub(*from));
-        holes.sum::<u64>() + last.saturating_sub(self.highest)
+        gaps.sum::<u64>() + last.saturating_sub(self.highest)
     }
 
     /// What to ask for: the oldest ranges.
     fn wanted(&self) -> Vec<[u64; 2]> {
-        let ranges = self.holes.iter().map(|(range, _)| *range);
+        let ranges = self.gaps.iter().map(|(range, _)| *range);
         ranges.take(Wanted::MAX_RANGES).collect()
     }
 
     /// Since when something has been missing [unix ns].
     fn since(&self) -> i64 {
-        self.holes.first().map_or(i64::MAX, |(_, since)| *since)
+        self.gaps.first().map_or(i64::MAX, |(_, since)| *since)
     }
 }
 
@@ -514,23 +514,23 @@ mod tests {
     const RUN: u64 = 5;
     const TOPIC: Topic = Topic::RecordedScan;
 
-    struct Wall {
-        catch_up: CatchUp<u64>,
+    struct Harness {
+        recovery: GapRecovery<u64>,
         car: CarName,
         now: i64,
         out: Vec<u64>,
         /// The answers to last calls.
-        sent: Vec<Vec<Sent>>,
+        sent: Vec<Vec<SentRange>>,
     }
 
-    impl Wall {
+    impl Harness {
         fn new() -> Self {
-            let mut catch_up = CatchUp::default();
-            catch_up.want_recorded(true);
+            let mut recovery = GapRecovery::default();
+            recovery.want_recorded(true);
             let car = CarName::new("car-1").expect("a good name");
-            catch_up.appeared(&car);
+            recovery.appeared(&car);
             Self {
-                catch_up,
+                recovery,
                 car,
                 now: SECOND,
                 out: Vec::new(),
@@ -540,13 +540,13 @@ mod tests {
 
         fn arrive_in(&mut self, run_id: u64, numbers: impl IntoIterator<Item = u64>) {
             for number in numbers {
-                let place = Place {
+                let id = MessageId {
                     topic: TOPIC,
                     run_id,
                     number,
                 };
                 self.out
-                    .extend(self.catch_up.arrive(&self.car, place, number, self.now));
+                    .extend(self.recovery.arrive(&self.car, id, number, self.now));
             }
         }
 
@@ -556,8 +556,8 @@ mod tests {
 
         /// Asks what is due and answers with the last number, and up to so many messages.
         fn ask(&mut self, first: u64, last: u64, most: usize) -> Vec<[u64; 2]> {
-            let question = self.catch_up.due(self.now).pop().expect("is due");
-            assert_eq!(self.catch_up.due(self.now), [], "one at a time");
+            let question = self.recovery.due(self.now).pop().expect("is due");
+            assert_eq!(self.recovery.due(self.now), [], "one at a time");
             let ranges: Vec<_> = question
                 .request
                 .streams
@@ -576,14 +576,14 @@ mod tests {
                 last,
             };
             let more = !sent.is_empty();
-            let (out, sent) = self.catch_up.answered(&self.car, RUN, &[kept], more, self.now);
+            let (out, sent) = self.recovery.answered(&self.car, RUN, &[kept], more, self.now);
             self.out.extend(out);
             self.sent.extend(sent);
             ranges
         }
 
         fn outstanding(&self) -> (u64, u64) {
-            let Outstanding { cars, messages } = self.catch_up.outstanding();
+            let Outstanding { cars, messages } = self.recovery.outstanding();
             (cars, messages)
         }
 
@@ -594,145 +594,149 @@ mod tests {
 
     #[test]
     fn a_newcomer_gets_the_last_hundred_in_order() {
-        let mut wall = Wall::new();
-        wall.arrive([300]);
+        let mut harness = Harness::new();
+        harness.arrive([300]);
         assert!(
-            wall.out.is_empty(),
+            harness.out.is_empty(),
             "held back until it is known what came before"
         );
-        assert_eq!(wall.ask(1, 300, 0), [] as [[u64; 2]; 0]);
-        wall.wait(0.5);
-        assert_eq!(wall.ask(1, 300, 1000), [[201, 299]]);
-        assert_eq!(wall.out, (201..=300).collect::<Vec<_>>());
+        assert_eq!(harness.ask(1, 300, 0), [] as [[u64; 2]; 0]);
+        harness.wait(0.5);
+        assert_eq!(harness.ask(1, 300, 1000), [[201, 299]]);
+        assert_eq!(harness.out, (201..=300).collect::<Vec<_>>());
     }
 
     #[test]
     fn what_comes_after_a_gap_waits_for_it_and_the_gap_is_asked_for_in_pieces() {
-        let mut wall = Wall::new();
-        wall.ask(1, 1, 1);
-        wall.wait(1.0);
-        wall.ask(1, 1, 1);
-        wall.out.clear();
-        wall.arrive([2, 5, 9]);
-        assert_eq!(wall.out, [2]);
-        wall.wait(1.0);
-        assert_eq!(wall.ask(1, 9, 3), [[3, 4], [6, 8]]);
-        assert_eq!(wall.out, [2, 3, 4, 5, 6]);
-        assert_eq!(wall.ask(1, 9, 3), [[7, 8]], "at once");
-        assert_eq!(wall.out, [2, 3, 4, 5, 6, 7, 8, 9]);
-        wall.arrive([7, 10]);
-        assert_eq!(wall.out.last(), Some(&10), "a second copy is dropped");
-        assert_eq!(wall.out.len(), 9);
+        let mut harness = Harness::new();
+        harness.ask(1, 1, 1);
+        harness.wait(1.0);
+        harness.ask(1, 1, 1);
+        harness.out.clear();
+        harness.arrive([2, 5, 9]);
+        assert_eq!(harness.out, [2]);
+        harness.wait(1.0);
+        assert_eq!(harness.ask(1, 9, 3), [[3, 4], [6, 8]]);
+        assert_eq!(harness.out, [2, 3, 4, 5, 6]);
+        assert_eq!(harness.ask(1, 9, 3), [[7, 8]], "at once");
+        assert_eq!(harness.out, [2, 3, 4, 5, 6, 7, 8, 9]);
+        harness.arrive([7, 10]);
+        assert_eq!(harness.out.last(), Some(&10), "a second copy is dropped");
+        assert_eq!(harness.out.len(), 9);
     }
 
     #[test]
     fn a_gap_that_nobody_fills_holds_back_for_a_while_only() {
-        let mut wall = Wall::new();
-        wall.arrive([1, 2]);
-        wall.ask(1, 2, 0);
-        wall.arrive([4]);
-        assert_eq!(wall.out, [1, 2]);
-        wall.wait(0.5 + HOLD as f64 / SECOND as f64);
-        assert_eq!(wall.catch_up.overdue(wall.now), [4]);
+        let mut harness = Harness::new();
+        harness.arrive([1, 2]);
+        harness.ask(1, 2, 0);
+        harness.arrive([4]);
+        assert_eq!(harness.out, [1, 2]);
+        harness.wait(0.5 + HOLD as f64 / SECOND as f64);
+        assert_eq!(harness.recovery.overdue(harness.now), [4]);
         // It is asked for all the same, until the car has it no more.
-        assert_eq!(wall.ask(4, 4, 1), [[3, 3]]);
-        wall.wait(1.0);
-        assert_eq!(wall.ask(4, 4, 1), [] as [[u64; 2]; 0]);
+        assert_eq!(harness.ask(4, 4, 1), [[3, 3]]);
+        harness.wait(1.0);
+        assert_eq!(harness.ask(4, 4, 1), [] as [[u64; 2]; 0]);
     }
 
     #[test]
     fn the_last_message_lost_is_missed_after_a_second() {
-        let mut wall = Wall::new();
-        wall.arrive([1]);
-        wall.ask(1, 1, 0);
-        wall.wait(1.0);
-        assert_eq!(wall.ask(1, 2, 0), [] as [[u64; 2]; 0], "2 may be on its way");
-        wall.wait(1.0);
-        wall.ask(1, 2, 0);
-        wall.wait(1.0);
-        assert_eq!(wall.ask(1, 2, 1), [[2, 2]]);
-        assert_eq!(wall.out, [1, 2]);
+        let mut harness = Harness::new();
+        harness.arrive([1]);
+        harness.ask(1, 1, 0);
+        harness.wait(1.0);
+        assert_eq!(harness.ask(1, 2, 0), [] as [[u64; 2]; 0], "2 may be on its way");
+        harness.wait(1.0);
+        harness.ask(1, 2, 0);
+        harness.wait(1.0);
+        assert_eq!(harness.ask(1, 2, 1), [[2, 2]]);
+        assert_eq!(harness.out, [1, 2]);
     }
 
     #[test]
-    fn a_last_call_brings_what_was_sent_by_then_within_tenths_of_a_second() {
-        let mut wall = Wall::new();
-        wall.arrive([1]);
-        wall.ask(1, 1, 0);
-        wall.arrive([2, 4]);
-        wall.wait(0.05);
-        wall.catch_up.last_call(wall.now);
-        assert_eq!(wall.outstanding(), (1, 0));
-        assert_eq!(wall.ask(1, 6, 0), [[3, 3]]);
-        let sent = Sent {
+    fn a_final_sync_brings_what_was_sent_by_then_within_tenths_of_a_second() {
+        let mut harness = Harness::new();
+        harness.arrive([1]);
+        harness.ask(1, 1, 0);
+        harness.arrive([2, 4]);
+        harness.wait(0.05);
+        harness.recovery.final_sync(harness.now);
+        assert_eq!(harness.outstanding(), (1, 0));
+        assert_eq!(harness.ask(1, 6, 0), [[3, 3]]);
+        let sent = SentRange {
             topic: TOPIC,
             from: 3,
             to: 6,
         };
-        assert_eq!(wall.sent, [[sent]]);
-        assert_eq!(wall.outstanding(), (0, 3), "3, 5 and 6");
-        wall.arrive([7]);
-        assert_eq!(wall.outstanding(), (0, 3), "7 was sent after it");
-        wall.wait(0.1);
-        assert_eq!(wall.ask(1, 9, 9), [[3, 3], [5, 6]]);
-        assert_eq!((wall.outstanding(), wall.sent.len()), ((0, 0), 1));
-        assert_eq!(wall.out, [1, 2, 3, 4, 5, 6, 7]);
+        assert_eq!(harness.sent, [[sent]]);
+        assert_eq!(harness.outstanding(), (0, 3), "3, 5 and 6");
+        harness.arrive([7]);
+        assert_eq!(harness.outstanding(), (0, 3), "7 was sent after it");
+        harness.wait(0.1);
+        assert_eq!(harness.ask(1, 9, 9), [[3, 3], [5, 6]]);
+        assert_eq!((harness.outstanding(), harness.sent.len()), ((0, 0), 1));
+        assert_eq!(harness.out, [1, 2, 3, 4, 5, 6, 7]);
     }
 
     #[test]
-    fn a_last_call_is_not_answered_by_what_was_asked_before_it() {
-        let mut wall = Wall::new();
-        let early = wall.catch_up.due(wall.now);
+    fn a_final_sync_is_not_answered_by_what_was_asked_before_it() {
+        let mut harness = Harness::new();
+        let early = harness.recovery.due(harness.now);
         assert_eq!(early.len(), 1);
-        wall.wait(0.1);
-        wall.catch_up.last_call(wall.now);
-        let (_, sent) = wall.catch_up.answered(&wall.car, RUN, &[], false, wall.now);
-        assert_eq!((sent, wall.outstanding()), (None, (1, 0)));
-        wall.ask(1, 1, 0);
-        assert_eq!(wall.outstanding(), (0, 1));
+        harness.wait(0.1);
+        harness.recovery.final_sync(harness.now);
+        let (_, sent) = harness
+            .recovery
+            .answered(&harness.car, RUN, &[], false, harness.now);
+        assert_eq!((sent, harness.outstanding()), (None, (1, 0)));
+        harness.ask(1, 1, 0);
+        assert_eq!(harness.outstanding(), (0, 1));
     }
 
     #[test]
     fn a_silent_car_is_not_waited_for_and_what_came_of_it_is_handed_on() {
-        let mut wall = Wall::new();
-        wall.arrive([1]);
-        wall.ask(1, 1, 0);
-        wall.arrive([3, 5]);
-        wall.wait(1.0);
-        wall.catch_up.last_call(wall.now);
-        assert_eq!(wall.catch_up.due(wall.now).len(), 1);
-        wall.catch_up.unanswered(&wall.car, wall.now);
-        assert_eq!(wall.outstanding(), (0, 0));
-        assert_eq!(wall.out, [1]);
-        assert_eq!(wall.catch_up.want_recorded(false), [3, 5]);
+        let mut harness = Harness::new();
+        harness.arrive([1]);
+        harness.ask(1, 1, 0);
+        harness.arrive([3, 5]);
+        harness.wait(1.0);
+        harness.recovery.final_sync(harness.now);
+        assert_eq!(harness.recovery.due(harness.now).len(), 1);
+        harness.recovery.unanswered(&harness.car, harness.now);
+        assert_eq!(harness.outstanding(), (0, 0));
+        assert_eq!(harness.out, [1]);
+        assert_eq!(harness.recovery.want_recorded(false), [3, 5]);
     }
 
     #[test]
     fn a_car_that_begins_anew_begins_with_one() {
-        let mut wall = Wall::new();
-        wall.arrive([1]);
-        wall.ask(1, 1, 0);
-        wall.arrive([3]);
-        wall.arrive_in(RUN + 1, [2]);
-        assert_eq!(wall.out, [1, 3], "what was held back is all there will be");
-        let question = wall.catch_up.due(wall.now).pop().expect("is due");
+        let mut harness = Harness::new();
+        harness.arrive([1]);
+        harness.ask(1, 1, 0);
+        harness.arrive([3]);
+        harness.arrive_in(RUN + 1, [2]);
+        assert_eq!(harness.out, [1, 3], "what was held back is all there will be");
+        let question = harness.recovery.due(harness.now).pop().expect("is due");
         assert_eq!(question.request.run_id, RUN + 1);
         assert_eq!(question.request.streams[0].ranges, [[1, 1]]);
-        wall.arrive_in(RUN, [2]);
-        assert_eq!(wall.out, [1, 3, 2], "a straggler");
-        wall.arrive_in(RUN + 1, [1]);
-        assert_eq!(wall.out, [1, 3, 2, 1, 2]);
+        harness.arrive_in(RUN, [2]);
+        assert_eq!(harness.out, [1, 3, 2], "a straggler");
+        harness.arrive_in(RUN + 1, [1]);
+        assert_eq!(harness.out, [1, 3, 2, 1, 2]);
     }
 
     #[test]
     fn answers_grow_on_a_fast_link_and_shrink_on_a_slow_one() {
-        let mut wall = Wall::new();
+        let mut harness = Harness::new();
         let budgets: Vec<_> = [0.001, 0.01, 0.001, 0.01, 0.1, 0.5, 0.5, 3.0]
             .map(|took| {
-                wall.wait(2.0);
-                let question = wall.catch_up.due(wall.now).pop().expect("is due");
-                wall.wait(took);
-                wall.catch_up.answered(&wall.car, RUN, &[], false, wall.now);
+                harness.wait(2.0);
+                let question = harness.recovery.due(harness.now).pop().expect("is due");
+                harness.wait(took);
+                harness
+                    .recovery
+                    .answered(&harness.car, RUN, &[], false, harness.now);
                 question.request.budget
             })
             .to_vec();
@@ -740,11 +744,11 @@ mod tests {
             budgets,
             [4000, 8000, 16_000, 32_000, 48_000, 48_000, 24_000, 12_000]
         );
-        wall.wait(2.0);
-        wall.catch_up.due(wall.now);
-        wall.catch_up.unanswered(&wall.car, wall.now);
-        wall.wait(1.0);
-        assert_eq!(wall.catch_up.due(wall.now)[0].request.budget, 4000);
+        harness.wait(2.0);
+        harness.recovery.due(harness.now);
+        harness.recovery.unanswered(&harness.car, harness.now);
+        harness.wait(1.0);
+        assert_eq!(harness.recovery.due(harness.now)[0].request.budget, 4000);
     }
 
     /// Whatever is lost, repeated and answered late: in the end each has been handed on, each once.
@@ -756,23 +760,23 @@ mod tests {
                 dice = dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
                 (dice >> 33) % sides
             };
-            let mut wall = Wall::new();
-            wall.ask(1, 1, 1);
+            let mut harness = Harness::new();
+            harness.ask(1, 1, 1);
             for number in 2..=300 {
-                wall.wait(0.025);
+                harness.wait(0.025);
                 if roll(3) > 0 {
-                    wall.arrive([number]);
+                    harness.arrive([number]);
                 }
-                if roll(4) == 0 && wall.now >= wall.catch_up.cars[&wall.car].due {
+                if roll(4) == 0 && harness.now >= harness.recovery.cars[&harness.car].due {
                     let most = roll(5) as usize;
-                    wall.ask(1, number, most);
+                    harness.ask(1, number, most);
                 }
             }
             for _ in 0..300 {
-                wall.wait(1.1);
-                wall.ask(1, 300, 7);
+                harness.wait(1.1);
+                harness.ask(1, 300, 7);
             }
-            assert_eq!(wall.out, (1..=300).collect::<Vec<_>>(), "seed {seed}");
+            assert_eq!(harness.out, (1..=300).collect::<Vec<_>>(), "seed {seed}");
         }
     }
 }

@@ -1,13 +1,25 @@
 //! All cars, as a pure state: events go in, views come out. No clock, no network.
 
+mod car;
+mod history;
+mod laps;
+mod log;
+mod sequence_tracker;
+mod stream_statistics;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{CarName, Event, EventKind, Header, Severity, Telemetry, Topic};
 
-use crate::car::{Car, CarView};
-use crate::event::{FleetEvent, Happening};
-use crate::log::{Log, LogEntry};
+use crate::event::{EventPayload, FleetEvent};
+
+pub use car::{Car, CarView, PoseView, SetView};
+pub use history::{HealthSample, ProfileCell};
+pub use laps::{Lap, LapGrip, SECTORS};
+pub use log::{Log, LogEntry};
+pub use sequence_tracker::{GapSummary, SequenceStatus, SequenceTracker};
+pub use stream_statistics::{StreamStatistics, StreamView};
 
 /// What the pit wall knows.
 ///
@@ -24,20 +36,20 @@ impl Fleet {
         let FleetEvent {
             at,
             car: name,
-            happening,
+            payload,
         } = event;
         let at = *at;
         let car = self
             .cars
             .entry(name.clone())
             .or_insert_with(|| Car::new(name.clone(), at));
-        match happening {
-            Happening::Appeared => {
+        match payload {
+            EventPayload::Appeared => {
                 car.alive = true;
                 car.last_heard = car.last_heard.max(at);
             }
-            Happening::Vanished => car.alive = false,
-            Happening::Message {
+            EventPayload::Vanished => car.alive = false,
+            EventPayload::Message {
                 topic,
                 header,
                 telemetry,
@@ -51,7 +63,7 @@ impl Fleet {
                     self.log.push(entry_of(event, name, when));
                 }
             }
-            Happening::Unreadable { topic, header, error } => {
+            EventPayload::Unreadable { topic, header, error } => {
                 let first = car.refuse(*topic, header.as_ref(), at);
                 if first {
                     self.log.push(LogEntry {
@@ -65,14 +77,14 @@ impl Fleet {
                     });
                 }
             }
-            Happening::Map { map, bytes } => car.map = Some((Arc::clone(map), Arc::clone(bytes))),
-            Happening::Info(info) => car.info = Some(info.clone()),
-            Happening::Marker { who, text } => {
+            EventPayload::Map { map, bytes } => car.map = Some((Arc::clone(map), Arc::clone(bytes))),
+            EventPayload::Info(info) => car.info = Some(info.clone()),
+            EventPayload::Marker { who, text } => {
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
                 self.say(at, car, Severity::Info, "marker", text, who);
             }
-            Happening::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
-            Happening::HowFar { .. } => {}
+            EventPayload::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
+            EventPayload::StreamEnds { .. } => {}
         }
         self.notice_link(&name.clone(), at);
     }
@@ -215,7 +227,7 @@ fn happened_at(header: &Header) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::event::Lane;
+    use crate::event::Delivery;
     use protocol::{Health, Schema, Stamps, State};
 
     const SECOND: i64 = 1_000_000_000;
@@ -224,7 +236,7 @@ mod tests {
         CarName::new("car-1").expect("a good name")
     }
 
-    fn message(at: i64, sequence: u64, lane: Lane, topic: Topic, telemetry: Telemetry) -> FleetEvent {
+    fn message(at: i64, sequence: u64, delivery: Delivery, topic: Topic, telemetry: Telemetry) -> FleetEvent {
         let stamps = Stamps {
             run_id: 1,
             sequence,
@@ -234,9 +246,9 @@ mod tests {
         FleetEvent {
             at,
             car: name(),
-            happening: Happening::Message {
+            payload: EventPayload::Message {
                 topic,
-                lane,
+                delivery,
                 header: Header::new(Schema::Health, 1, stamps),
                 telemetry: Box::new(telemetry),
                 bytes: Arc::new([]),
@@ -244,7 +256,7 @@ mod tests {
         }
     }
 
-    fn health(at: i64, sequence: u64, lane: Lane, state: State) -> FleetEvent {
+    fn health(at: i64, sequence: u64, delivery: Delivery, state: State) -> FleetEvent {
         let health = Health {
             state,
             since: 0,
@@ -254,14 +266,14 @@ mod tests {
             proposal: None,
             auto: false,
         };
-        message(at, sequence, lane, Topic::Health, Telemetry::Health(health))
+        message(at, sequence, delivery, Topic::Health, Telemetry::Health(health))
     }
 
     fn appeared(at: i64) -> FleetEvent {
         FleetEvent {
             at,
             car: name(),
-            happening: Happening::Appeared,
+            payload: EventPayload::Appeared,
         }
     }
 
@@ -269,14 +281,14 @@ mod tests {
     fn both_lanes_together_count_each_message_once() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
-        for (sequence, lane) in [
-            (1, Lane::Live),
-            (1, Lane::Complete),
-            (3, Lane::Live),
-            (2, Lane::Complete),
-            (3, Lane::Complete),
+        for (sequence, delivery) in [
+            (1, Delivery::Live),
+            (1, Delivery::InOrder),
+            (3, Delivery::Live),
+            (2, Delivery::InOrder),
+            (3, Delivery::InOrder),
         ] {
-            fleet.apply(&health(1, sequence, lane, State::Localized));
+            fleet.apply(&health(1, sequence, delivery, State::Localized));
         }
         let view = &fleet.view(2)[0].streams["health"];
         assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
@@ -286,9 +298,9 @@ mod tests {
     fn a_late_message_does_not_turn_the_state_back() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
-        fleet.apply(&health(1, 1, Lane::Live, State::Localized));
-        fleet.apply(&health(1, 3, Lane::Live, State::Lost));
-        fleet.apply(&health(1, 2, Lane::Complete, State::Degraded));
+        fleet.apply(&health(1, 1, Delivery::Live, State::Localized));
+        fleet.apply(&health(1, 3, Delivery::Live, State::Lost));
+        fleet.apply(&health(1, 2, Delivery::InOrder, State::Degraded));
         assert_eq!(fleet.view(2)[0].state, "LOST");
     }
 
@@ -296,14 +308,14 @@ mod tests {
     fn a_silent_car_is_blind_and_said_so_once() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
-        fleet.apply(&health(0, 1, Lane::Live, State::Localized));
+        fleet.apply(&health(0, 1, Delivery::Live, State::Localized));
         fleet.tick(SECOND / 2);
         assert_eq!(fleet.view(SECOND / 2)[0].state, "LOCALIZED");
         for tick in 3..6 {
             fleet.tick(tick * SECOND);
         }
         assert_eq!(fleet.view(6 * SECOND)[0].state, "BLIND");
-        fleet.apply(&health(7 * SECOND, 2, Lane::Live, State::Localized));
+        fleet.apply(&health(7 * SECOND, 2, Delivery::Live, State::Localized));
         let said: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
         assert_eq!(said, ["BLIND: nothing comes from the car", "link is back"]);
     }
@@ -346,8 +358,8 @@ mod tests {
                 command: None,
             })
         };
-        fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
-        fleet.apply(&message(1, 1, Lane::Complete, Topic::Event, lap()));
+        fleet.apply(&message(1, 1, Delivery::InOrder, Topic::Event, lap()));
+        fleet.apply(&message(1, 1, Delivery::InOrder, Topic::Event, lap()));
         assert_eq!(fleet.car(&name()).map(|car| car.laps().len()), Some(1));
         assert_eq!(fleet.log().since(0).count(), 1);
     }

@@ -76,7 +76,7 @@ impl From<RecordingStreamError> for RerunError {
 }
 
 impl RerunView {
-    /// History that the server keeps for viewers that come later [bytes].
+    /// HealthHistory that the server keeps for viewers that come later [bytes].
     const MEMORY: u64 = 256 * 1024 * 1024;
     /// Rows wait this long for others of their kind: five times fewer chunks than a live stream has by default, which
     /// is what a viewer in a browser spends its time on.

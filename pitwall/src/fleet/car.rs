@@ -9,9 +9,9 @@ use protocol::{
 };
 use serde::Serialize;
 
-use crate::history::{History, Moment, Place, Strip};
-use crate::laps::{Lap, LapBook, Passed};
-use crate::stream::{Stream, StreamView, Taken};
+use super::history::{HealthHistory, HealthProfile, HealthSample, ProfileCell};
+use super::laps::{Lap, LapTimer, TrackPose};
+use super::stream_statistics::{Freshness, StreamStatistics, StreamView};
 
 /// A car as the pit wall sees it.
 #[derive(Debug, Clone)]
@@ -46,11 +46,11 @@ pub struct Car {
     pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
     /// What runs on it.
     pub info: Option<CarInfo>,
-    laps: LapBook,
-    history: History,
-    strip: Strip,
+    laps: LapTimer,
+    history: HealthHistory,
+    health_profile: HealthProfile,
     clock: Option<ClockEstimate>,
-    streams: BTreeMap<Topic, Stream>,
+    streams: BTreeMap<Topic, StreamStatistics>,
 }
 
 /// How far the car's clock is ahead of the laptop's.
@@ -90,9 +90,9 @@ impl Car {
             truth: None,
             map: None,
             info: None,
-            laps: LapBook::default(),
-            history: History::default(),
-            strip: Strip::default(),
+            laps: LapTimer::default(),
+            history: HealthHistory::default(),
+            health_profile: HealthProfile::default(),
             clock: None,
             streams: BTreeMap::new(),
         }
@@ -103,10 +103,10 @@ impl Car {
     pub(crate) fn take(&mut self, topic: Topic, header: &Header, telemetry: &Telemetry, at: i64) -> bool {
         self.last_heard = self.last_heard.max(at);
         let news = match self.streams.entry(topic).or_default().arrive(header, at) {
-            Taken::Newest => true,
+            Freshness::Newest => true,
             // Better told late than never.
-            Taken::Older => topic == Topic::Event,
-            Taken::Repeated => false,
+            Freshness::Older => topic == Topic::Event,
+            Freshness::Duplicate => false,
         };
         if !news {
             return false;
@@ -117,7 +117,7 @@ impl Car {
             Telemetry::Pose(pose) => {
                 self.pose = Some((*header, *pose));
                 if let (Some(track), Some(length)) = (pose.track, self.lap_length()) {
-                    let here = Passed {
+                    let here = TrackPose {
                         at: header.sensor,
                         s: track.s,
                         d: track.d,
@@ -135,7 +135,7 @@ impl Car {
                 }
                 let s = self.pose.and_then(|(_, pose)| Some(pose.track?.s));
                 if let (Some(s), Some(length)) = (s, self.lap_length()) {
-                    self.strip.take(s, length, health);
+                    self.health_profile.take(s, length, health);
                 }
                 self.health = Some(health.clone());
             }
@@ -164,14 +164,14 @@ impl Car {
     }
 
     /// The last two minutes of health, the oldest first.
-    pub fn history(&self) -> impl Iterator<Item = &Moment> {
-        self.history.moments()
+    pub fn history(&self) -> impl Iterator<Item = &HealthSample> {
+        self.history.samples()
     }
 
-    /// Health along the lap, the last time the car was there: places of equal length from the start line on. Empty
+    /// Health along the lap, the last time the car was there: cells of equal length from the start line on. Empty
     /// without a raceline.
-    pub fn strip(&self) -> &[Option<Place>] {
-        self.strip.places()
+    pub fn health_profile(&self) -> &[Option<ProfileCell>] {
+        self.health_profile.cells()
     }
 
     /// Length of a lap [m]; None without a raceline.
@@ -245,7 +245,7 @@ impl Car {
         let (late, poses) = streams().find_map(|stream| stream.transit(now)).or_else(|| {
             // Nothing comes, but for signs of life: at least that late is what will.
             let newest = streams()
-                .filter_map(Stream::newest)
+                .filter_map(StreamStatistics::newest)
                 .map(|header| header.published)
                 .max()?;
             let late = (now - newest) as f64 * 1e-9;

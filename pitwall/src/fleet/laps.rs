@@ -1,7 +1,7 @@
 //! Laps with their sectors, and what each was like.
 //!
 //! A car tells when a lap ended and how long it took. Where the lap's time went, the pit wall reads off the poses:
-//! the moments at which `s` passes each third of the raceline, between two poses by the straight line.
+//! the samples at which `s` passes each third of the raceline, between two poses by the straight line.
 
 use std::collections::VecDeque;
 
@@ -46,16 +46,16 @@ impl LapGrip {
 
 /// All laps of one car.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct LapBook {
+pub(crate) struct LapTimer {
     laps: Vec<Lap>,
     /// Laps under way or just ended, the newest last.
     traces: VecDeque<Trace>,
-    last: Option<Passed>,
+    last: Option<TrackPose>,
 }
 
 /// A pose on the raceline.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Passed {
+pub(crate) struct TrackPose {
     /// When it was true [unix ns].
     pub(crate) at: i64,
     /// Along the raceline [m].
@@ -82,7 +82,7 @@ struct Trace {
     alignment: f64,
 }
 
-impl LapBook {
+impl LapTimer {
     /// Most laps kept.
     const MAX_LAPS: usize = 500;
     /// Laps that may wait for their end to be told.
@@ -95,7 +95,7 @@ impl LapBook {
     }
 
     /// Takes in a pose on a raceline of `length` [m].
-    pub(crate) fn on_pose(&mut self, here: Passed, length: f64) {
+    pub(crate) fn on_pose(&mut self, here: TrackPose, length: f64) {
         let before = self.last.replace(here);
         // A car that starts again counts its laps from the beginning.
         if self.traces.back().is_some_and(|trace| trace.lap > here.lap) {
@@ -202,13 +202,13 @@ struct Step {
 
 impl Step {
     /// None for a jump, a pause, and for driving backwards.
-    fn between(before: Passed, here: Passed, length: f64) -> Option<Self> {
+    fn between(before: TrackPose, here: TrackPose, length: f64) -> Option<Self> {
         let mut ahead = here.s - before.s;
         let over_line = ahead < -length / 2.0;
         if over_line {
             ahead += length;
         }
-        let in_time = (1..=LapBook::GAP).contains(&(here.at - before.at));
+        let in_time = (1..=LapTimer::GAP).contains(&(here.at - before.at));
         (in_time && ahead > 0.0 && ahead < length / 4.0).then_some(Self {
             from: (before.at, before.s),
             to: (here.at, before.s + ahead),
@@ -231,10 +231,10 @@ mod tests {
     const LENGTH: f64 = 30.0;
 
     /// Drives at 40 poses a second: 5 m/s in the first sector, 10 in the second, 2.5 in the third.
-    fn drive(book: &mut LapBook, laps: u32) {
+    fn drive(book: &mut LapTimer, laps: u32) {
         let (mut s, mut at, mut lap) = (29.0, 0, 0);
         while lap < laps + 1 {
-            book.on_pose(Passed { at, s, d: -0.1, lap }, LENGTH);
+            book.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
             let speed = [5.0, 10.0, 2.5][(s / 10.0) as usize % SECTORS];
             s += speed / 40.0;
             at += 25_000_000;
@@ -243,12 +243,12 @@ mod tests {
                 lap += 1;
             }
         }
-        book.on_pose(Passed { at, s, d: -0.1, lap }, LENGTH);
+        book.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
     }
 
     #[test]
     fn sectors_add_up_to_the_lap() {
-        let mut book = LapBook::default();
+        let mut book = LapTimer::default();
         drive(&mut book, 2);
         book.on_lap(2, 7.0, "hq");
         let lap = &book.laps()[0];
@@ -264,7 +264,7 @@ mod tests {
 
     #[test]
     fn a_lap_whose_news_comes_first_has_its_last_sector() {
-        let mut book = LapBook::default();
+        let mut book = LapTimer::default();
         drive(&mut book, 1);
         let begun_two = book.traces.back().expect("a lap").lap;
         book.traces.pop_back();
@@ -273,8 +273,8 @@ mod tests {
     }
 
     /// In the first lap, on the line.
-    fn passed(at: i64, s: f64) -> Passed {
-        Passed {
+    fn passed(at: i64, s: f64) -> TrackPose {
+        TrackPose {
             at,
             s,
             d: 0.0,
@@ -284,7 +284,7 @@ mod tests {
 
     #[test]
     fn a_jump_passes_no_border() {
-        let mut book = LapBook::default();
+        let mut book = LapTimer::default();
         book.on_pose(passed(0, 5.0), LENGTH);
         book.on_pose(passed(25_000_000, 15.0), LENGTH);
         book.on_pose(passed(9_000_000_000, 16.0), LENGTH);
@@ -294,7 +294,7 @@ mod tests {
 
     #[test]
     fn slip_is_told_as_a_share_of_the_lap() {
-        let mut book = LapBook::default();
+        let mut book = LapTimer::default();
         book.on_pose(passed(0, 5.0), LENGTH);
         for slip in [0.0, 0.05, -0.3, 0.1] {
             let alignment = 0.8;

@@ -7,11 +7,11 @@ use serde::Serialize;
 
 /// The last two minutes, twice a second.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct History(VecDeque<Moment>);
+pub(crate) struct HealthHistory(VecDeque<HealthSample>);
 
 /// A car's health at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Moment {
+pub struct HealthSample {
     /// When it arrived, by the laptop's clock [unix ns].
     pub at: i64,
     /// The state.
@@ -26,7 +26,7 @@ pub struct Moment {
     pub spread_across: f32,
 }
 
-impl Moment {
+impl HealthSample {
     fn new(at: i64, health: &Health) -> Option<Self> {
         let metrics = health.metrics?;
         Some(Self {
@@ -40,7 +40,7 @@ impl Moment {
     }
 }
 
-impl History {
+impl HealthHistory {
     /// From one moment to the next [ns].
     const EVERY: i64 = 500_000_000;
     /// Moments kept.
@@ -50,7 +50,7 @@ impl History {
         if self.0.back().is_some_and(|last| at - last.at < Self::EVERY) {
             return;
         }
-        if let Some(moment) = Moment::new(at, health) {
+        if let Some(moment) = HealthSample::new(at, health) {
             if self.0.len() == Self::MAX {
                 self.0.pop_front();
             }
@@ -59,21 +59,21 @@ impl History {
     }
 
     /// The oldest first.
-    pub(crate) fn moments(&self) -> impl Iterator<Item = &Moment> {
+    pub(crate) fn samples(&self) -> impl Iterator<Item = &HealthSample> {
         self.0.iter()
     }
 }
 
 /// The health at each place of a lap, the last time that the car was there.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Strip {
-    places: Vec<Option<Place>>,
+pub(crate) struct HealthProfile {
+    cells: Vec<Option<ProfileCell>>,
     last: Option<usize>,
 }
 
 /// What was measured at a place.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Place {
+pub struct ProfileCell {
     /// The state.
     pub state: State,
     /// Alignment, in `[0, 1]`.
@@ -82,7 +82,7 @@ pub struct Place {
     pub slip: f32,
 }
 
-impl Strip {
+impl HealthProfile {
     /// Places of a lap, of equal length.
     const PLACES: usize = 120;
 
@@ -91,13 +91,13 @@ impl Strip {
         let Some(metrics) = health.metrics else {
             return;
         };
-        self.places.resize(Self::PLACES, None);
+        self.cells.resize(Self::PLACES, None);
         let share = s / length;
         if !(0.0..=1.0).contains(&share) {
             return;
         }
         let here = ((share * Self::PLACES as f64) as usize).min(Self::PLACES - 1);
-        let place = Place {
+        let place = ProfileCell {
             state: health.state,
             alignment: metrics.alignment,
             slip: metrics.slip,
@@ -112,14 +112,14 @@ impl Strip {
             driven.saturating_sub(1)
         };
         for back in 0..=driven {
-            self.places[(here + Self::PLACES - back) % Self::PLACES] = Some(place);
+            self.cells[(here + Self::PLACES - back) % Self::PLACES] = Some(place);
         }
         self.last = Some(here);
     }
 
     /// From the start line onwards; empty before the first.
-    pub(crate) fn places(&self) -> &[Option<Place>] {
-        &self.places
+    pub(crate) fn cells(&self) -> &[Option<ProfileCell>] {
+        &self.cells
     }
 }
 
@@ -145,42 +145,42 @@ mod tests {
 
     #[test]
     fn two_minutes_are_kept() {
-        let mut history = History::default();
+        let mut history = HealthHistory::default();
         for i in 0..3000 {
             history.take(i * 100_000_000, &health(0.9));
         }
-        let moments: Vec<_> = history.moments().collect();
-        assert_eq!(moments.len(), History::MAX);
+        let samples: Vec<_> = history.samples().collect();
+        assert_eq!(samples.len(), HealthHistory::MAX);
         assert!(
-            moments
+            samples
                 .windows(2)
-                .all(|pair| pair[1].at - pair[0].at == History::EVERY)
+                .all(|pair| pair[1].at - pair[0].at == HealthHistory::EVERY)
         );
     }
 
     #[test]
     fn what_was_driven_over_is_painted_and_nothing_else() {
-        let mut strip = Strip::default();
+        let mut health_profile = HealthProfile::default();
         let length = 60.0;
-        // Two places a message, over the start line.
+        // Two cells a message, over the start line.
         for s in [58.0, 59.0, 0.0, 1.0] {
-            strip.take(s, length, &health(0.5));
+            health_profile.take(s, length, &health(0.5));
         }
-        let painted: Vec<usize> = (0..Strip::PLACES)
-            .filter(|&i| strip.places()[i].is_some())
+        let painted: Vec<usize> = (0..HealthProfile::PLACES)
+            .filter(|&i| health_profile.cells()[i].is_some())
             .collect();
         assert_eq!(painted, [0, 1, 2, 116, 117, 118, 119]);
-        strip.take(30.0, length, &health(0.7));
+        health_profile.take(30.0, length, &health(0.7));
         assert_eq!(
-            strip.places().iter().flatten().count(),
+            health_profile.cells().iter().flatten().count(),
             8,
             "a jump paints only where it ends"
         );
         for s in [f64::NAN, -1.0, 61.0] {
-            strip.take(s, length, &health(0.1));
+            health_profile.take(s, length, &health(0.1));
         }
         assert_eq!(
-            strip.places().iter().flatten().count(),
+            health_profile.cells().iter().flatten().count(),
             8,
             "off the line paints nothing"
         );

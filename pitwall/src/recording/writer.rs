@@ -11,8 +11,8 @@ use serde::Serialize;
 
 use super::foxglove::{self, Exported};
 use super::note::Note;
-use crate::event::{FleetEvent, Happening, Sent};
-use crate::gaps::{Arrival, GapSummary, Gaps};
+use crate::event::{EventPayload, FleetEvent, SentRange};
+use crate::fleet::{GapSummary, SequenceStatus, SequenceTracker};
 
 /// Encoding of messages as they came.
 pub(super) const WIRE_ENCODING: &str = "synpf-v1";
@@ -21,24 +21,24 @@ pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
 
 /// A stream being recorded.
 #[derive(Default)]
-struct Recorded {
-    gaps: Gaps,
+struct RecordedStream {
+    gaps: SequenceTracker,
     /// When the newest message was published.
-    until: Moment,
+    until: PublishTime,
 }
 
-/// A moment of a car: its run id, and its clock [unix ns].
-type Moment = (u64, i64);
+/// The run and the time of publishing and its clock [unix ns].
+type PublishTime = (u64, i64);
 
 /// How far a car's streams go: what it published later is not recorded, so that they all end together.
-type End = Moment;
+type End = PublishTime;
 
 /// A recording being written.
-pub(super) struct RecordingFile<W: Write + Seek> {
+pub(super) struct RecordingWriter<W: Write + Seek> {
     writer: Writer<W>,
     channels: HashMap<String, u16>,
     schemas: HashMap<&'static str, u16>,
-    streams: BTreeMap<Key, Recorded>,
+    streams: BTreeMap<Key, RecordedStream>,
     /// Where the recording ends, for each car that has said so.
     ends: BTreeMap<CarName, End>,
     notes: u32,
@@ -47,7 +47,7 @@ pub(super) struct RecordingFile<W: Write + Seek> {
     last: Option<i64>,
 }
 
-impl<W: Write + Seek> RecordingFile<W> {
+impl<W: Write + Seek> RecordingWriter<W> {
     pub(super) fn new(writer: W) -> Result<Self, mcap::McapError> {
         let options = WriteOptions::new()
             .profile("")
@@ -67,9 +67,9 @@ impl<W: Write + Seek> RecordingFile<W> {
 
     /// Writes an event. A message that is in the file already is not written again, and none from after the end.
     pub(super) fn write(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
-        let FleetEvent { at, car, happening } = event;
-        match happening {
-            Happening::Message {
+        let FleetEvent { at, car, payload } = event;
+        match payload {
+            EventPayload::Message {
                 topic,
                 header,
                 telemetry,
@@ -83,7 +83,7 @@ impl<W: Write + Seek> RecordingFile<W> {
                 let key = Key::new(car.clone(), *topic);
                 let name = key.to_string();
                 let stream = self.streams.entry(key).or_default();
-                if stream.gaps.arrive(header.run_id, header.sequence) == Arrival::Repeated {
+                if stream.gaps.arrive(header.run_id, header.sequence) == SequenceStatus::Duplicate {
                     return Ok(());
                 }
                 stream.until = stream.until.max(published);
@@ -100,7 +100,7 @@ impl<W: Write + Seek> RecordingFile<W> {
                     }
                 }
             }
-            Happening::Map { map, bytes } => {
+            EventPayload::Map { map, bytes } => {
                 let name = Key::new(car.clone(), Topic::Map).to_string();
                 let times = Times {
                     arrived: *at,
@@ -110,13 +110,13 @@ impl<W: Write + Seek> RecordingFile<W> {
                 self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
                 self.write_json(car, &foxglove::export_map(map, *at), times)?;
             }
-            Happening::HowFar {
+            EventPayload::StreamEnds {
                 run_id,
-                said,
-                streams,
+                published,
+                outstanding,
             } => {
-                self.ends.insert(car.clone(), (*run_id, *said));
-                for Sent { topic, from, to } in streams {
+                self.ends.insert(car.clone(), (*run_id, *published));
+                for SentRange { topic, from, to } in outstanding {
                     let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
                     stream.gaps.sent(*run_id, *from, *to);
                 }
@@ -147,17 +147,17 @@ impl<W: Write + Seek> RecordingFile<W> {
     }
 
     /// What is in the file.
-    pub(super) fn summary(&self) -> Summary {
+    pub(super) fn summary(&self) -> RecordingSummary {
         let mut ends = self.ends.clone();
         for (key, stream) in &self.streams {
             let end = ends.entry(key.car.clone()).or_default();
             *end = stream.until.max(*end);
         }
-        let behind = |car: &CarName, until: Moment| {
+        let behind = |car: &CarName, until: PublishTime| {
             let end = ends.get(car).copied().unwrap_or(until);
             (end.0 == until.0).then(|| (end.1 - until.1) as f64 * 1e-9)
         };
-        Summary {
+        RecordingSummary {
             duration_s: self
                 .first
                 .zip(self.last)
@@ -178,7 +178,7 @@ impl<W: Write + Seek> RecordingFile<W> {
     }
 
     /// Writes the summary and the index, and ends the file.
-    pub(super) fn finish(mut self) -> Result<(Summary, W), mcap::McapError> {
+    pub(super) fn finish(mut self) -> Result<(RecordingSummary, W), mcap::McapError> {
         let mut summary = self.summary();
         let mut cars: Vec<_> = self.streams.into_keys().map(|key| key.car).collect();
         cars.dedup();
@@ -262,7 +262,7 @@ struct Times {
 
 /// What is in a recording, and what is not.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct Summary {
+pub struct RecordingSummary {
     /// From the first event to the last [s].
     pub duration_s: f64,
     /// Messages and notes.
@@ -288,14 +288,14 @@ pub struct StreamSummary {
     pub gaps: GapSummary,
 }
 
-impl Summary {
+impl RecordingSummary {
     /// Messages that were sent and are not in the file.
     pub fn missing(&self) -> u64 {
         self.streams.iter().map(|stream| stream.gaps.missing).sum()
     }
 }
 
-impl fmt::Display for Summary {
+impl fmt::Display for RecordingSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,

@@ -5,12 +5,12 @@ use std::collections::{BTreeSet, VecDeque};
 use protocol::Header;
 use serde::Serialize;
 
-use crate::gaps::{Arrival, Gaps};
+use super::sequence_tracker::{SequenceStatus, SequenceTracker};
 
 /// What is known of one topic of one car.
 #[derive(Debug, Clone, Default)]
-pub struct Stream {
-    gaps: Gaps,
+pub struct StreamStatistics {
+    gaps: SequenceTracker,
     /// When the last messages were published, and when the newest arrived [unix ns].
     published: VecDeque<i64>,
     arrived: i64,
@@ -18,7 +18,7 @@ pub struct Stream {
     unreadable: u64,
     /// The newest message of all, where that one could not be read.
     refused: Option<Header>,
-    /// Run id and number of messages that could not be read, until one of a later number can: only that one proves that
+    /// Run and number of messages that could not be read, until one of a later number can: only that one proves that
     /// there is such a run.
     unproven: BTreeSet<(u64, u64)>,
     late_by: f64,
@@ -28,26 +28,26 @@ pub struct Stream {
 
 /// What a message was to its stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Taken {
+pub enum Freshness {
     /// Newer than all before it.
     Newest,
     /// It was missing until now.
     Older,
     /// It had come already.
-    Repeated,
+    Duplicate,
 }
 
 /// [ns]
 const SECOND: i64 = 1_000_000_000;
 
-impl Stream {
+impl StreamStatistics {
     /// Messages that a rate is taken over.
     const WINDOW: usize = 64;
     /// Messages that could not be read and are remembered by their numbers.
     const UNPROVEN: usize = 4096;
 
     /// Takes note of a message that arrived at `at` [unix ns].
-    pub fn arrive(&mut self, header: &Header, at: i64) -> Taken {
+    pub fn arrive(&mut self, header: &Header, at: i64) -> Freshness {
         let order = |h: &Header| (h.run_id, h.sequence);
         let later = self.unproven.split_off(&order(header));
         for (run_id, sequence) in std::mem::replace(&mut self.unproven, later) {
@@ -56,8 +56,8 @@ impl Stream {
             }
         }
         let arrival = self.gaps.arrive(header.run_id, header.sequence);
-        if arrival == Arrival::Repeated {
-            return Taken::Repeated;
+        if arrival == SequenceStatus::Duplicate {
+            return Freshness::Duplicate;
         }
         let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
         if newer {
@@ -77,7 +77,11 @@ impl Stream {
                 self.transits.pop_front();
             }
         }
-        if newer { Taken::Newest } else { Taken::Older }
+        if newer {
+            Freshness::Newest
+        } else {
+            Freshness::Older
+        }
     }
 
     /// Takes note of bytes that could not be read; returns how many there were. What came and cannot be read is not
@@ -93,7 +97,7 @@ impl Stream {
                     self.unproven.pop_first();
                 }
             } else {
-                // In the present run it fills its gap; one of an earlier run is left alone.
+                // In the current run it fills its gap; one of an earlier run is left alone.
                 self.gaps.arrive(header.run_id, header.sequence);
             }
         }
@@ -133,7 +137,7 @@ impl Stream {
         self.newest.map(|_| self.arrived)
     }
 
-    /// Messages per second, up to `now` [unix ns]; falls when nothing comes. Taken from when they were published,
+    /// Messages per second, up to `now` [unix ns]; falls when nothing comes. Freshness from when they were published,
     /// because what a car has kept for us arrives all at once.
     pub fn rate(&self, now: i64) -> f64 {
         let (Some(first), Some(last)) = (self.published.front(), self.published.back()) else {
@@ -208,7 +212,7 @@ mod tests {
 
     #[test]
     fn the_rate_is_steady_and_falls_in_silence() {
-        let mut stream = Stream::default();
+        let mut stream = StreamStatistics::default();
         for i in 0..100 {
             let at = i as i64 * SECOND / 40;
             stream.arrive(&published(i + 1, at), at);
@@ -222,7 +226,7 @@ mod tests {
 
     #[test]
     fn a_burst_of_what_was_kept_is_no_high_rate() {
-        let mut stream = Stream::default();
+        let mut stream = StreamStatistics::default();
         for i in 0..20 {
             stream.arrive(&published(i + 1, i as i64 * SECOND), 20 * SECOND);
         }
@@ -231,11 +235,16 @@ mod tests {
 
     #[test]
     fn an_older_message_fills_a_gap_but_is_not_newer() {
-        let mut stream = Stream::default();
+        let mut stream = StreamStatistics::default();
         let taken = [1, 3, 2, 3].map(|number| stream.arrive(&header(number), 0));
         assert_eq!(
             taken,
-            [Taken::Newest, Taken::Newest, Taken::Older, Taken::Repeated]
+            [
+                Freshness::Newest,
+                Freshness::Newest,
+                Freshness::Older,
+                Freshness::Duplicate
+            ]
         );
         let view = stream.view(0, 0);
         assert_eq!((view.received, view.missing, view.filled_late), (3, 0, 1));
@@ -243,7 +252,7 @@ mod tests {
 
     #[test]
     fn what_came_and_cannot_be_read_is_not_missing() {
-        let mut stream = Stream::default();
+        let mut stream = StreamStatistics::default();
         stream.arrive(&header(1), 0);
         stream.refuse(Some(&header(2)));
         stream.refuse(Some(&header(3)));
@@ -255,12 +264,12 @@ mod tests {
 
     #[test]
     fn an_unreadable_header_of_nobody_stops_no_stream() {
-        let mut stream = Stream::default();
+        let mut stream = StreamStatistics::default();
         let mut forged = header(u64::MAX);
         forged.run_id = u64::MAX;
         for number in 1..4 {
             stream.refuse(Some(&forged));
-            assert_eq!(stream.arrive(&header(number), 0), Taken::Newest);
+            assert_eq!(stream.arrive(&header(number), 0), Freshness::Newest);
         }
         let view = stream.view(0, 0);
         assert_eq!((view.received, view.missing, view.sender_restarts), (3, 0, 0));

@@ -1,21 +1,19 @@
 //! `pitwall watch`: the cars on a whole terminal screen, or as plain lines or JSON where nobody looks.
 
-mod keys;
-mod screen;
-
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pitwall::{CarView, Hub, LogEntry, unix_now};
+use pitwall::{CarView, FleetService, LogEntry, unix_now};
 use protocol::CarName;
 
 use super::{FIND, await_car, no_such_car, open, time_or_interrupt};
-use crate::cli::LinkOptions;
+use crate::cli::NetworkOptions;
 use crate::output;
+use crate::terminal::{screen, text};
 
 pub(super) async fn run(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: Option<CarName>,
     time: Option<Duration>,
     rate: Option<f64>,
@@ -25,42 +23,48 @@ pub(super) async fn run(
     let screen = !json && output::on_terminal();
     let rate = rate.unwrap_or(if screen { 10.0 } else { 1.0 });
     let period = Duration::from_secs_f64(1.0 / rate);
-    let hub = open(link).await?;
+    let service = open(network).await?;
     if let Some(car) = &car
-        && !await_car(&hub, car, patience).await
+        && !await_car(&service, car, patience).await
     {
-        return Ok(no_such_car(&hub, car).await);
+        return Ok(no_such_car(&service, car).await);
     }
     if screen {
-        let operator = link.operator();
+        let operator = network.operator();
         tokio::select! {
-            outcome = screen::run(hub.clone(), car, operator, period) => outcome?,
+            outcome = screen::run(service.clone(), car, operator, period) => outcome?,
             () = time_or_interrupt(time) => {}
         }
     } else {
         tokio::select! {
-            outcome = lines(&hub, car.as_ref(), period, json) => outcome?,
+            outcome = lines(&service, car.as_ref(), period, json) => outcome?,
             () = time_or_interrupt(time) => {}
         }
     }
-    hub.close().await;
+    service.close().await;
     Ok(ExitCode::SUCCESS)
 }
 
 /// One car, or all where none is named, again and again.
-async fn lines(hub: &Arc<Hub>, car: Option<&CarName>, period: Duration, json: bool) -> anyhow::Result<()> {
+async fn lines(
+    service: &Arc<FleetService>,
+    car: Option<&CarName>,
+    period: Duration,
+    json: bool,
+) -> anyhow::Result<()> {
     let mut ticks = tokio::time::interval(period);
     let mut seen = 0;
     // The first view waits for the car to have said something.
-    hub.wait_until(FIND, |fleet| {
-        let mut cars = fleet.cars().filter(|c| car.is_none_or(|car| *car == c.name));
-        cars.any(|car| car.health.is_some() && car.pose.is_some())
-    })
-    .await;
+    service
+        .wait_until(FIND, |fleet| {
+            let mut cars = fleet.cars().filter(|c| car.is_none_or(|car| *car == c.name));
+            cars.any(|car| car.health.is_some() && car.pose.is_some())
+        })
+        .await;
     loop {
         ticks.tick().await;
         let (views, news): (Vec<CarView>, Vec<LogEntry>) = {
-            let fleet = hub.fleet();
+            let fleet = service.fleet();
             let news = fleet.log().since(seen);
             let news = news.filter(|e| car.is_none() || e.car.as_ref() == car);
             let news = news.cloned().collect();
@@ -70,15 +74,15 @@ async fn lines(hub: &Arc<Hub>, car: Option<&CarName>, period: Duration, json: bo
         };
         match (car, &views[..]) {
             (Some(_), []) => {}
-            (Some(_), [view, ..]) if json => output::say_json(view)?,
-            (None, views) if json => output::say_json(&views)?,
+            (Some(_), [view, ..]) if json => output::print_json(view)?,
+            (None, views) if json => output::print_json(&views)?,
             (car, views) => {
                 for entry in &news {
-                    output::say(&super::events::line(entry));
+                    output::print(&text::log_line(entry));
                 }
-                output::say(&match (car, views) {
-                    (Some(_), [view, ..]) => output::card(view),
-                    _ => output::table(views),
+                output::print(&match (car, views) {
+                    (Some(_), [view, ..]) => text::card(view),
+                    _ => text::table(views),
                 });
             }
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
-use pitwall::{CarView, Hub, LogEntry, Moment, unix_now};
+use pitwall::{CarView, FleetService, HealthSample, LogEntry, unix_now};
 use protocol::{Action, CarName, Severity};
 use ratatui::crossterm::event::{self, Event, KeyEventKind};
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -13,26 +13,25 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Paragraph, Row, Sparkline, Table, TableState};
 use ratatui::{DefaultTerminal, Frame};
 
-use super::keys::{Choice, Offer, Wish};
-use crate::commands::events::line;
-use crate::output;
+use super::keys::{Choices, KeyAction, Selection};
+use super::text;
 
 /// What is on the screen.
 #[derive(Default)]
 struct Shown {
     cars: Vec<CarView>,
     /// Health of the selected car over the last two minutes.
-    history: Vec<Moment>,
+    history: Vec<HealthSample>,
     log: Vec<LogEntry>,
     alarms: usize,
-    choice: Choice,
+    selection: Selection,
     /// What became of the last command, and whether it was done; None while it is under way.
     answer: Option<(Option<bool>, String)>,
 }
 
 /// Shows the cars until somebody presses q.
-pub(super) async fn run(
-    hub: Arc<Hub>,
+pub(crate) async fn run(
+    service: Arc<FleetService>,
     car: Option<CarName>,
     operator: String,
     period: Duration,
@@ -43,7 +42,7 @@ pub(super) async fn run(
     let stop = Guard(leave.clone());
     let work = tokio::task::spawn_blocking(move || {
         let mut terminal = ratatui::try_init()?;
-        let shown = loop_until(&mut terminal, &hub, car, &operator, period, &runtime, &leave);
+        let shown = loop_until(&mut terminal, &service, car, &operator, period, &runtime, &leave);
         ratatui::try_restore()?;
         shown
     });
@@ -63,7 +62,7 @@ impl Drop for Guard {
 
 fn loop_until(
     terminal: &mut DefaultTerminal,
-    hub: &Arc<Hub>,
+    service: &Arc<FleetService>,
     car: Option<CarName>,
     operator: &str,
     period: Duration,
@@ -74,12 +73,12 @@ fn loop_until(
     let mut wanted = car;
     let (answers, answered): (Sender<_>, Receiver<_>) = channel();
     while !leave.load(std::sync::atomic::Ordering::Relaxed) {
-        shown.look(hub);
+        shown.look(service);
         if let Some(at) = wanted
             .as_ref()
             .and_then(|name| shown.cars.iter().position(|c| c.car == *name))
         {
-            shown.choice.car = at;
+            shown.selection.car = at;
             wanted = None;
         }
         shown.answer = answered.try_iter().last().or(shown.answer);
@@ -94,15 +93,15 @@ fn loop_until(
             continue;
         }
         match shown.press(key) {
-            Wish::Nothing => {}
-            Wish::Quit => return Ok(()),
-            Wish::Acknowledge => hub.fleet().acknowledge(unix_now(), operator),
-            Wish::Do(action) => {
-                if let Some(view) = shown.cars.get(shown.choice.car) {
+            KeyAction::Nothing => {}
+            KeyAction::Quit => return Ok(()),
+            KeyAction::Acknowledge => service.fleet().acknowledge(unix_now(), operator),
+            KeyAction::Do(action) => {
+                if let Some(view) = shown.cars.get(shown.selection.car) {
                     shown.answer = Some((None, format!("{}: asking the car", view.car)));
                     let revision = view.set.as_ref().map(|set| set.revision);
                     let order = give(
-                        hub.clone(),
+                        service.clone(),
                         view.car.clone(),
                         operator.to_owned(),
                         revision,
@@ -119,7 +118,7 @@ fn loop_until(
 
 /// Gives a command, and says what became of it.
 async fn give(
-    hub: Arc<Hub>,
+    service: Arc<FleetService>,
     car: CarName,
     operator: String,
     revision: Option<u64>,
@@ -127,7 +126,7 @@ async fn give(
 ) -> (Option<bool>, String) {
     // A change of the set is meant for the one that is on the screen.
     let expected = matches!(action, Action::Params(_)).then_some(revision).flatten();
-    match hub.link().command(&car, &operator, expected, action).await {
+    match service.client().command(&car, &operator, expected, action).await {
         Ok(verdict) => (Some(verdict.exit_code() == 0), verdict.text(&car)),
         Err(error) => (Some(false), format!("{car}: {error}")),
     }
@@ -137,8 +136,8 @@ impl Shown {
     const LOG: usize = 200;
 
     /// Takes in how things are.
-    fn look(&mut self, hub: &Hub) {
-        let fleet = hub.fleet();
+    fn look(&mut self, service: &FleetService) {
+        let fleet = service.fleet();
         self.cars = fleet.view(unix_now());
         self.alarms = fleet.log().alarms();
         let from = fleet.log().last().saturating_sub(Self::LOG as u64);
@@ -147,22 +146,22 @@ impl Shown {
         self.log.sort_by_key(|entry| entry.at);
         let selected = self
             .cars
-            .get(self.choice.car)
+            .get(self.selection.car)
             .and_then(|view| fleet.car(&view.car));
         self.history = selected
             .map(|car| car.history().copied().collect())
             .unwrap_or_default();
     }
 
-    fn press(&mut self, key: event::KeyEvent) -> Wish {
+    fn press(&mut self, key: event::KeyEvent) -> KeyAction {
         let cars: Vec<_> = self.cars.iter().map(|car| car.car.clone()).collect();
-        let set = self.cars.get(self.choice.car).and_then(|car| car.set.as_ref());
+        let set = self.cars.get(self.selection.car).and_then(|car| car.set.as_ref());
         let sets = set.map(|set| set.available.clone()).unwrap_or_default();
-        let offer = Offer {
+        let choices = Choices {
             cars: &cars,
             sets: &sets,
         };
-        self.choice.press(key, offer)
+        self.selection.press(key, choices)
     }
 
     fn draw(&self, frame: &mut Frame<'_>) {
@@ -182,9 +181,9 @@ impl Shown {
         self.draw_car(frame, areas[1]);
         self.draw_log(frame, areas[2]);
         self.draw_foot(frame, areas[3]);
-        if self.choice.help {
+        if self.selection.help {
             popup(frame, "keys", &HELP.map(str::to_owned));
-        } else if let Some(at) = self.choice.sets {
+        } else if let Some(at) = self.selection.sets {
             self.draw_sets(frame, at);
         }
     }
@@ -222,10 +221,10 @@ impl Shown {
                     car.streams.get("pose").map_or(0.0, |s| s.rate_hz)
                 ))
                 .right_aligned(),
-                Line::from(output::number(car.pose.as_ref().map(|p| p.age_s * 1e3), 0)).right_aligned(),
-                Line::from(output::number(car.round_trip_s.map(|s| s * 1e3), 1)).right_aligned(),
+                Line::from(text::number(car.pose.as_ref().map(|p| p.age_s * 1e3), 0)).right_aligned(),
+                Line::from(text::number(car.round_trip_s.map(|s| s * 1e3), 1)).right_aligned(),
                 Line::from(missing.to_string()).right_aligned(),
-                Line::from(output::number(car.last_lap_s, 2)).right_aligned(),
+                Line::from(text::number(car.last_lap_s, 2)).right_aligned(),
                 Line::from(car.causes.join("; ")),
             ])
             .style(Style::new().add_modifier(quiet))
@@ -237,7 +236,7 @@ impl Shown {
             .header(columns(head.map(Line::from)).dim())
             .row_highlight_style(Style::new().reversed())
             .block(Block::bordered().title(" pit wall "));
-        let mut state = TableState::new().with_selected(self.choice.car);
+        let mut state = TableState::new().with_selected(self.selection.car);
         if self.cars.is_empty() {
             let text = "no car yet; start one with car-node run ... --connect tcp/THIS-LAPTOP:7447";
             frame.render_widget(
@@ -250,13 +249,13 @@ impl Shown {
     }
 
     fn draw_car(&self, frame: &mut Frame<'_>, area: Rect) {
-        let Some(car) = self.cars.get(self.choice.car) else {
+        let Some(car) = self.cars.get(self.selection.car) else {
             return;
         };
         let block = Block::bordered()
             .title(format!(" {} ", car.car))
             .border_style(style_of(&car.state));
-        let card = output::card(car);
+        let card = text::card(car);
         let room = area.width.saturating_sub(2) as usize;
         let mut lines: Vec<Line<'_>> = card
             .lines()
@@ -279,7 +278,7 @@ impl Shown {
             ]),
         );
         if let Some(shadow) = &car.shadow {
-            let comparison = crate::commands::params::compare_short(shadow);
+            let comparison = text::comparison(shadow);
             lines.extend(wrapped(&comparison, room, 8).into_iter().map(Line::from));
         }
         // The curve takes only what the words leave.
@@ -322,7 +321,7 @@ impl Shown {
                     Severity::Warning => Style::new().fg(Color::Yellow),
                     Severity::Critical => Style::new().fg(Color::Red).bold(),
                 };
-                wrapped(&line(entry), width, 13)
+                wrapped(&text::log_line(entry), width, 13)
                     .into_iter()
                     .map(move |part| Line::styled(part, style))
             })
@@ -363,7 +362,7 @@ impl Shown {
     fn draw_sets(&self, frame: &mut Frame<'_>, at: usize) {
         let Some((car, set)) = self
             .cars
-            .get(self.choice.car)
+            .get(self.selection.car)
             .and_then(|car| Some((car, car.set.as_ref()?)))
         else {
             return;
@@ -480,7 +479,7 @@ fn style_of(state: &str) -> Style {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pitwall::{Fleet, FleetEvent, Happening};
+    use pitwall::{EventPayload, Fleet, FleetEvent};
     use ratatui::Terminal;
     use ratatui::backend::TestBackend;
 
@@ -496,7 +495,7 @@ mod tests {
             fleet.apply(&FleetEvent {
                 at: 0,
                 car: name.parse().expect("a name"),
-                happening: Happening::Appeared,
+                payload: EventPayload::Appeared,
             });
         }
         fleet.tick(7_000_000_000);
@@ -560,8 +559,8 @@ mod tests {
     fn any_size_can_be_drawn() {
         let mut shown = shown();
         for (sets, help) in [(None, false), (Some(3), false), (None, true)] {
-            shown.choice.sets = sets;
-            shown.choice.help = help;
+            shown.selection.sets = sets;
+            shown.selection.help = help;
             for (width, height) in [(1, 1), (10, 3), (40, 12), (80, 24), (250, 80)] {
                 picture(&shown, width, height);
             }

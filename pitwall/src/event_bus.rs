@@ -1,22 +1,22 @@
 //! Where events arrive: the fleet, a recording that may be going on, and whoever else listens.
 //!
-//! Live events and a replay's go the same way, [`Board::take`].
+//! Live events and a replay's go the same way, [`EventBus::take`].
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crossbeam_channel::{Receiver, Sender, TrySendError};
 
-use crate::event::{FleetEvent, Happening};
+use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
-use crate::recording::{Progress, Recorder};
+use crate::recording::{Recorder, RecordingProgress};
 
 /// The state of all cars, shared by those who fill it and those who show it.
 #[derive(Default)]
-pub struct Board {
+pub struct EventBus {
     state: Mutex<State>,
     recorder: Mutex<Option<Recorder>>,
-    taps: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
+    subscribers: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
 }
 
 #[derive(Default)]
@@ -49,53 +49,64 @@ impl FleetGuard<'_> {
     }
 }
 
-impl Board {
+impl EventBus {
     /// What is known. Hold it briefly.
     pub fn fleet(&self) -> FleetGuard<'_> {
         FleetGuard(self.state.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Takes in an event and hands it on to the recorder and to all taps.
-    pub fn take(&self, event: FleetEvent) {
+    /// Takes in an event and hands it on to the recorder and to all subscribers.
+    pub fn publish(&self, event: FleetEvent) {
         self.fleet().apply(&event);
         let event = Arc::new(event);
         if let Some(recorder) = &*self.recorder() {
-            recorder.take(&event);
+            recorder.record(&event);
         }
-        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
-        taps.retain(|tap| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))));
+        let mut subscribers = self.subscribers.lock().unwrap_or_else(PoisonError::into_inner);
+        subscribers.retain(|subscriber| {
+            !matches!(
+                subscriber.try_send(event.clone()),
+                Err(TrySendError::Disconnected(_))
+            )
+        });
     }
 
     /// Puts `fleet` in place of what was known: a replay has jumped to `at` [unix ns]. Taps are told what a newcomer
     /// needs to know: they have not seen what lies between.
-    pub fn restart(&self, fleet: Fleet, at: i64) {
+    pub fn replace_fleet(&self, fleet: Fleet, at: i64) {
         {
             let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
             state.fleet = fleet;
             state.epoch += 1;
         }
-        let events: Vec<_> = self.known(at).into_iter().map(Arc::new).collect();
-        let mut taps = self.taps.lock().unwrap_or_else(PoisonError::into_inner);
-        taps.retain(|tap| {
-            events
-                .iter()
-                .all(|event| !matches!(tap.try_send(event.clone()), Err(TrySendError::Disconnected(_))))
+        let events: Vec<_> = self.current_state(at).into_iter().map(Arc::new).collect();
+        let mut subscribers = self.subscribers.lock().unwrap_or_else(PoisonError::into_inner);
+        subscribers.retain(|subscriber| {
+            events.iter().all(|event| {
+                !matches!(
+                    subscriber.try_send(event.clone()),
+                    Err(TrySendError::Disconnected(_))
+                )
+            })
         });
     }
 
     /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
-    pub fn tap(&self, now: i64) -> Receiver<Arc<FleetEvent>> {
+    pub fn subscribe(&self, now: i64) -> Receiver<Arc<FleetEvent>> {
         const WAITING: usize = 20_000;
-        let (tap, events) = crossbeam_channel::bounded(WAITING);
-        for event in self.known(now) {
-            drop(tap.try_send(Arc::new(event)));
+        let (subscriber, events) = crossbeam_channel::bounded(WAITING);
+        for event in self.current_state(now) {
+            drop(subscriber.try_send(Arc::new(event)));
         }
-        self.taps.lock().unwrap_or_else(PoisonError::into_inner).push(tap);
+        self.subscribers
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(subscriber);
         events
     }
 
     /// The file that is being recorded into, and how that is getting on.
-    pub fn recording(&self) -> Option<(PathBuf, Progress)> {
+    pub fn recording(&self) -> Option<(PathBuf, RecordingProgress)> {
         let recorder = self.recorder();
         recorder
             .as_ref()
@@ -108,31 +119,31 @@ impl Board {
     }
 
     /// What a recording that begins at `at` [unix ns] would otherwise not know.
-    pub(crate) fn known(&self, at: i64) -> Vec<FleetEvent> {
+    pub(crate) fn current_state(&self, at: i64) -> Vec<FleetEvent> {
         let fleet = self.fleet();
         let mut events = Vec::new();
         for car in fleet.cars() {
-            let mut push = |happening| {
+            let mut push = |payload| {
                 events.push(FleetEvent {
                     at,
                     car: car.name.clone(),
-                    happening,
+                    payload,
                 });
             };
             if car.alive {
-                push(Happening::Appeared);
+                push(EventPayload::Appeared);
             }
             if let Some((map, bytes)) = &car.map {
-                push(Happening::Map {
+                push(EventPayload::Map {
                     map: map.clone(),
                     bytes: bytes.clone(),
                 });
             }
             if let Some(info) = &car.info {
-                push(Happening::Info(info.clone()));
+                push(EventPayload::Info(info.clone()));
             }
             if let Some((offset, round_trip)) = car.clock() {
-                push(Happening::Clock { offset, round_trip });
+                push(EventPayload::Clock { offset, round_trip });
             }
         }
         events
@@ -145,16 +156,16 @@ mod tests {
 
     #[test]
     fn after_a_jump_a_tap_knows_the_cars() {
-        let board = Board::default();
-        let events = board.tap(0);
+        let bus = EventBus::default();
+        let events = bus.subscribe(0);
         assert!(events.is_empty());
         let mut fleet = Fleet::default();
         fleet.apply(&FleetEvent {
             at: 1,
             car: "car-1".parse().expect("a name"),
-            happening: Happening::Appeared,
+            payload: EventPayload::Appeared,
         });
-        board.restart(fleet, 5);
+        bus.replace_fleet(fleet, 5);
         let event = events.try_recv().expect("what a newcomer needs to know");
         assert_eq!((event.at, event.car.as_str()), (5, "car-1"));
     }

@@ -1,5 +1,5 @@
 //! Reads a recording back: the same events as the live pit wall had. A message that cannot be read is an event, too
-//! ([`Happening::Unreadable`]), as it is live; a channel that is of no kind known here is passed over with a warning.
+//! ([`EventPayload::Unreadable`]), as it is live; a channel that is of no kind known here is passed over with a warning.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -11,9 +11,9 @@ use mcap::io::MessageReader;
 use mcap::sans_io::LinearReaderOptions;
 use protocol::{Header, Key, MapReply, Telemetry, Topic, decode};
 
-use super::file::{RecordingError, WIRE_ENCODING};
 use super::note::Note;
-use crate::event::{FleetEvent, Happening, Lane};
+use super::writer::{RecordingError, WIRE_ENCODING};
+use crate::event::{Delivery, EventPayload, FleetEvent};
 
 /// The events of a recording, in the order in which they were written.
 pub struct Recording<R: Read> {
@@ -60,7 +60,7 @@ impl<R: Read> Iterator for Recording<R> {
             let at = message.log_time as i64;
             let event = if message.channel.message_encoding == WIRE_ENCODING {
                 let key = channel.parse::<Key>().map_err(|e| e.to_string());
-                key.and_then(|key| Ok((happening(key.topic, &message.data)?, key.car)))
+                key.and_then(|key| Ok((payload(key.topic, &message.data)?, key.car)))
             } else if let Some(car) = Note::car(channel) {
                 let note = serde_json::from_slice::<Note>(&message.data);
                 note.map(|note| (note.into(), car)).map_err(|e| e.to_string())
@@ -69,7 +69,7 @@ impl<R: Read> Iterator for Recording<R> {
                 continue;
             };
             match event {
-                Ok((happening, car)) => return Some(Ok(FleetEvent { at, car, happening })),
+                Ok((payload, car)) => return Some(Ok(FleetEvent { at, car, payload })),
                 Err(error) => {
                     if self.foreign.insert(channel.to_owned()) {
                         tracing::warn!(channel, error, "passed over; was it recorded by a newer pitwall?");
@@ -81,25 +81,25 @@ impl<R: Read> Iterator for Recording<R> {
 }
 
 /// What a message as it came says. An error for a topic that is not recorded.
-fn happening(topic: Topic, data: &[u8]) -> Result<Happening, String> {
+fn payload(topic: Topic, data: &[u8]) -> Result<EventPayload, String> {
     let bytes = || data.into();
-    let happening = if topic == Topic::Map {
-        decode::<MapReply>(data).map(|(_, map)| Happening::Map {
+    let payload = if topic == Topic::Map {
+        decode::<MapReply>(data).map(|(_, map)| EventPayload::Map {
             map: Arc::new(map),
             bytes: bytes(),
         })
     } else {
         let telemetry =
             Telemetry::decode(topic, data).ok_or_else(|| format!("{topic} carries no telemetry"))?;
-        telemetry.map(|(header, telemetry)| Happening::Message {
+        telemetry.map(|(header, telemetry)| EventPayload::Message {
             topic,
-            lane: Lane::Complete,
+            delivery: Delivery::InOrder,
             header,
             telemetry: Box::new(telemetry),
             bytes: bytes(),
         })
     };
-    Ok(happening.unwrap_or_else(|error| Happening::Unreadable {
+    Ok(payload.unwrap_or_else(|error| EventPayload::Unreadable {
         topic,
         header: Header::read(data).ok(),
         error: error.to_string(),

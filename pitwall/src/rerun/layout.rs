@@ -13,7 +13,7 @@ use rerun::external::re_sdk_types::blueprint::archetypes::EyeControls3D;
 use rerun::log::LogMsg;
 use rerun::{Points3D, RecordingStream, RecordingStreamBuilder, RecordingStreamError};
 
-use crate::event::{FleetEvent, Happening};
+use crate::event::{EventPayload, FleetEvent};
 
 /// What is plotted of each car, with its title.
 pub(super) const CURVES: [(&str, &str); 6] = [
@@ -53,7 +53,7 @@ impl Layout {
             return None;
         }
         self.cars.insert(event.car.clone());
-        if let (None, Happening::Map { map, .. }) = (&self.map, &event.happening) {
+        if let (None, EventPayload::Map { map, .. }) = (&self.map, &event.payload) {
             self.map = Some(map.clone());
         }
         let waited = event.at - *self.since.get_or_insert(event.at);
@@ -227,16 +227,16 @@ mod tests {
         })
     }
 
-    fn event(car: &str, at: i64, happening: Happening) -> FleetEvent {
+    fn event(car: &str, at: i64, payload: EventPayload) -> FleetEvent {
         FleetEvent {
             at,
             car: car.parse().expect("a name"),
-            happening,
+            payload,
         }
     }
 
-    fn with_map() -> Happening {
-        Happening::Map {
+    fn with_map() -> EventPayload {
+        EventPayload::Map {
             map: map(),
             bytes: Arc::default(),
         }
@@ -247,9 +247,9 @@ mod tests {
         let second = 1_000_000_000;
         let mut layout = Layout::default();
         assert!(layout.settle().is_none(), "there is no car yet");
-        assert!(layout.learn(&event("car-2", 0, Happening::Appeared)).is_none());
+        assert!(layout.learn(&event("car-2", 0, EventPayload::Appeared)).is_none());
         assert!(layout.learn(&event("car-1", second, with_map())).is_none());
-        let plan = layout.learn(&event("car-2", 2 * second, Happening::Appeared));
+        let plan = layout.learn(&event("car-2", 2 * second, EventPayload::Appeared));
         let plan = plan.expect("a map and time enough");
         assert_eq!(
             plan.cars.iter().map(CarName::as_str).collect::<Vec<_>>(),
@@ -262,8 +262,8 @@ mod tests {
     #[test]
     fn without_a_map_there_is_a_layout_in_the_end() {
         let mut layout = Layout::default();
-        assert!(layout.learn(&event("car-1", 0, Happening::Appeared)).is_none());
-        let late = event("car-1", Layout::MAPLESS + 1, Happening::Vanished);
+        assert!(layout.learn(&event("car-1", 0, EventPayload::Appeared)).is_none());
+        let late = event("car-1", Layout::MAPLESS + 1, EventPayload::Vanished);
         assert!(layout.learn(&late).is_some_and(|plan| plan.map.is_none()));
     }
 

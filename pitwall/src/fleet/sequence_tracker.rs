@@ -7,15 +7,15 @@ use serde::Serialize;
 /// The arrivals of one stream: one sender, one key.
 ///
 /// Counting begins with the first message that comes in: what was sent before that is not missing. A sender that
-/// starts again has a new run id and begins a new count; what was missing of the old one stays missing.
+/// starts again, which its run_id tells, begins a new count; what was missing of the old one stays missing.
 #[derive(Debug, Clone, Default)]
-pub struct Gaps {
+pub struct SequenceTracker {
     run_id: u64,
     first: u64,
     last: u64,
     received: u64,
     restarts: u64,
-    /// Missing ranges of the present run, ascending.
+    /// Missing ranges of the present run_id, ascending.
     missing: Vec<RangeInclusive<u64>>,
     /// Missing numbers of earlier runs, and of ranges that no longer fit the list.
     missing_before: u64,
@@ -24,7 +24,7 @@ pub struct Gaps {
 
 /// What an arrival was.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Arrival {
+pub enum SequenceStatus {
     /// The next one, or the first.
     New,
     /// A later one: some before it are missing.
@@ -32,25 +32,25 @@ pub enum Arrival {
     /// An earlier one that was missing until now.
     Late,
     /// One that had come already, or was sent before the count began.
-    Repeated,
+    Duplicate,
 }
 
-impl Gaps {
+impl SequenceTracker {
     /// A stream with more holes than this is counted, not listed.
     const MAX_RANGES: usize = 4096;
 
     /// Takes note of a message. Those with sequence number 0 are not counted.
-    pub fn arrive(&mut self, run_id: u64, sequence: u64) -> Arrival {
+    pub fn arrive(&mut self, run_id: u64, sequence: u64) -> SequenceStatus {
         if sequence == 0 {
-            return Arrival::New;
+            return SequenceStatus::New;
         }
         if self.last == 0 || run_id > self.run_id {
             self.begin(run_id, sequence);
             self.received += 1;
-            return Arrival::New;
+            return SequenceStatus::New;
         }
         if run_id < self.run_id {
-            return Arrival::Repeated;
+            return SequenceStatus::Duplicate;
         }
         if sequence > self.last {
             let gap = sequence > self.last + 1;
@@ -59,10 +59,14 @@ impl Gaps {
             }
             self.last = sequence;
             self.received += 1;
-            return if gap { Arrival::AfterGap } else { Arrival::New };
+            return if gap {
+                SequenceStatus::AfterGap
+            } else {
+                SequenceStatus::New
+            };
         }
         let Some(at) = self.missing.iter().position(|range| range.contains(&sequence)) else {
-            return Arrival::Repeated;
+            return SequenceStatus::Duplicate;
         };
         let range = self.missing.remove(at);
         let rest = [*range.start()..=sequence - 1, sequence + 1..=*range.end()];
@@ -71,7 +75,7 @@ impl Gaps {
         }
         self.received += 1;
         self.filled += 1;
-        Arrival::Late
+        SequenceStatus::Late
     }
 
     /// Takes note that the messages up to number `to` were sent. Where none has come yet, the count begins with `from`.
@@ -88,7 +92,7 @@ impl Gaps {
         self.last = self.last.max(to);
     }
 
-    /// Begins with this number of a run.
+    /// Begins with this number of a run_id.
     fn begin(&mut self, run_id: u64, number: u64) {
         if self.last > 0 {
             self.restarts += 1;
@@ -158,7 +162,7 @@ impl Gaps {
 /// What came of a stream and what did not.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct GapSummary {
-    /// The number with which the count begins, of the sender's last run.
+    /// The number with which the count begins, of the sender's last run_id.
     pub first: u64,
     /// The highest number that came or is known to have been sent.
     pub last: u64,
@@ -166,7 +170,7 @@ pub struct GapSummary {
     pub received: u64,
     /// Messages missing in all.
     pub missing: u64,
-    /// The missing numbers of the sender's last run, as `[from, to]`.
+    /// The missing numbers of the sender's last run_id, as `[from, to]`.
     pub missing_ranges: Vec<[u64; 2]>,
     /// Messages that came late.
     pub filled_late: u64,
@@ -178,8 +182,8 @@ pub struct GapSummary {
 mod tests {
     use super::*;
 
-    fn gaps(sequences: &[u64]) -> Gaps {
-        let mut gaps = Gaps::default();
+    fn gaps(sequences: &[u64]) -> SequenceTracker {
+        let mut gaps = SequenceTracker::default();
         for &sequence in sequences {
             gaps.arrive(1, sequence);
         }
@@ -196,23 +200,23 @@ mod tests {
     fn a_hole_is_named_and_fills_from_anywhere() {
         let mut gaps = gaps(&[1, 2, 7]);
         assert_eq!(gaps.summary().missing_ranges, [[3, 6]]);
-        assert_eq!(gaps.arrive(1, 4), Arrival::Late);
+        assert_eq!(gaps.arrive(1, 4), SequenceStatus::Late);
         assert_eq!(gaps.summary().missing_ranges, [[3, 3], [5, 6]]);
-        assert_eq!(gaps.arrive(1, 3), Arrival::Late);
-        assert_eq!(gaps.arrive(1, 6), Arrival::Late);
-        assert_eq!(gaps.arrive(1, 5), Arrival::Late);
+        assert_eq!(gaps.arrive(1, 3), SequenceStatus::Late);
+        assert_eq!(gaps.arrive(1, 6), SequenceStatus::Late);
+        assert_eq!(gaps.arrive(1, 5), SequenceStatus::Late);
         assert_eq!((gaps.missing(), gaps.filled(), gaps.received()), (0, 4, 7));
-        assert_eq!(gaps.arrive(1, 5), Arrival::Repeated);
+        assert_eq!(gaps.arrive(1, 5), SequenceStatus::Duplicate);
         assert_eq!(gaps.received(), 7);
     }
 
     #[test]
     fn a_sender_that_starts_again_counts_anew_and_forgives_nothing() {
         let mut gaps = gaps(&[1, 3]);
-        assert_eq!(gaps.arrive(2, 3), Arrival::New);
+        assert_eq!(gaps.arrive(2, 3), SequenceStatus::New);
         assert_eq!(
             gaps.arrive(1, 2),
-            Arrival::Repeated,
+            SequenceStatus::Duplicate,
             "a straggler of the old run_id"
         );
         let summary = gaps.summary();
@@ -227,14 +231,14 @@ mod tests {
         assert_eq!(gaps.missing(), 0);
         gaps.sent(1, 7, 9);
         assert_eq!((gaps.last(), gaps.summary().missing_ranges), (9, vec![[7, 9]]));
-        assert_eq!(gaps.arrive(1, 8), Arrival::Late);
-        assert_eq!(gaps.arrive(1, 10), Arrival::New);
+        assert_eq!(gaps.arrive(1, 8), SequenceStatus::Late);
+        assert_eq!(gaps.arrive(1, 10), SequenceStatus::New);
         assert_eq!(gaps.summary().missing_ranges, [[7, 7], [9, 9]]);
 
-        let mut nothing_came = Gaps::default();
+        let mut nothing_came = SequenceTracker::default();
         nothing_came.sent(1, 3, 5);
         assert_eq!((nothing_came.missing(), nothing_came.received()), (3, 0));
-        assert_eq!(nothing_came.arrive(1, 3), Arrival::Late);
+        assert_eq!(nothing_came.arrive(1, 3), SequenceStatus::Late);
         assert_eq!(nothing_came.missing(), 2);
 
         nothing_came.sent(2, 1, 2);
@@ -249,6 +253,6 @@ mod tests {
         let sequences: Vec<_> = (0..10_000).map(|i| 2 * i + 1).collect();
         let gaps = gaps(&sequences);
         assert_eq!(gaps.missing(), 9_999);
-        assert_eq!(gaps.missing.len(), Gaps::MAX_RANGES);
+        assert_eq!(gaps.missing.len(), SequenceTracker::MAX_RANGES);
     }
 }

@@ -2,15 +2,15 @@
 
 use std::process::ExitCode;
 
-use pitwall::{Hub, Verdict};
+use pitwall::{FleetService, Verdict};
 use protocol::{Action, CarName, Outcome, Rates, RatesAction, RelocalizeAction, Reply};
 
 use super::{FIND, no_such_car, open};
-use crate::cli::{LinkOptions, Place, RateOptions};
+use crate::cli::{NetworkOptions, Place, RateOptions};
 use crate::output;
 
 pub(super) async fn locate(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     how: &Place,
     json: bool,
@@ -20,31 +20,31 @@ pub(super) async fn locate(
         (None, Some(candidate)) => Action::Relocalize(RelocalizeAction::Pick { candidate }),
         (None, None) => Action::Relocalize(RelocalizeAction::Search),
     };
-    give(link, car, action, None, json).await
+    give(network, car, action, None, json).await
 }
 
 pub(super) async fn auto(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     on: bool,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    give(link, car, Action::Auto(on), None, json).await
+    give(network, car, Action::Auto(on), None, json).await
 }
 
 pub(super) async fn rates(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     wanted: &RateOptions,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(no_such_car(&hub, car).await);
+    let service = open(network).await?;
+    if !service.wait_for(car, FIND).await {
+        return Ok(no_such_car(&service, car).await);
     }
-    let verdict = hub
-        .link()
-        .command(car, &link.operator(), None, Action::Rates(RatesAction::Get))
+    let verdict = service
+        .client()
+        .command(car, &network.operator(), None, Action::Rates(RatesAction::Get))
         .await?;
     let now = reply(&verdict).and_then(|reply| match reply {
         Reply::Rates(rates) => Some(*rates),
@@ -69,44 +69,50 @@ pub(super) async fn rates(
                 recorded: recorded.unwrap_or(now.recorded),
             };
             let action = Action::Rates(RatesAction::Set(rates));
-            hub.link().command(car, &link.operator(), None, action).await?
+            service
+                .client()
+                .command(car, &network.operator(), None, action)
+                .await?
         }
         _ => verdict,
     };
-    tell(&hub, car, &verdict, json).await
+    tell(&service, car, &verdict, json).await
 }
 
 /// Gives a command and tells what became of it.
 pub(super) async fn give(
-    link: &LinkOptions,
+    network: &NetworkOptions,
     car: &CarName,
     action: Action,
     expect: Option<u64>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    let hub = open(link).await?;
-    if !hub.wait_for(car, FIND).await {
-        return Ok(no_such_car(&hub, car).await);
+    let service = open(network).await?;
+    if !service.wait_for(car, FIND).await {
+        return Ok(no_such_car(&service, car).await);
     }
-    let verdict = hub.link().command(car, &link.operator(), expect, action).await?;
-    tell(&hub, car, &verdict, json).await
+    let verdict = service
+        .client()
+        .command(car, &network.operator(), expect, action)
+        .await?;
+    tell(&service, car, &verdict, json).await
 }
 
 /// Tells what became of a command; its exit code does too.
 pub(super) async fn tell(
-    hub: &Hub,
+    service: &FleetService,
     car: &CarName,
     verdict: &Verdict,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     if json {
-        output::say_json(verdict)?;
+        output::print_json(verdict)?;
     } else {
         match reply(verdict) {
             Some(Reply::Candidates(candidates)) => {
                 for c in candidates {
                     let heading = c.pose.heading.to_degrees();
-                    output::say(&format!(
+                    output::print(&format!(
                         "candidate {}: ({:.2}, {:.2}) m, {heading:.1} deg, fits the scans to {:.0} %",
                         c.number,
                         c.pose.x,
@@ -116,18 +122,18 @@ pub(super) async fn tell(
                 }
             }
             Some(Reply::Rates(rates)) => {
-                output::say(&rates.to_string());
+                output::print(&rates.to_string());
             }
             _ => {}
         }
         let text = verdict.text(car);
         if verdict.exit_code() == 0 {
-            output::say(&text);
+            output::print(&text);
         } else {
-            output::complain(&text);
+            output::print_error(&text);
         }
     }
-    hub.close().await;
+    service.close().await;
     Ok(ExitCode::from(verdict.exit_code()))
 }
 

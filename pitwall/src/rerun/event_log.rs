@@ -22,7 +22,7 @@ use rerun::{
 };
 
 use super::layout::{CURVES, Layout, curve};
-use crate::event::{FleetEvent, Happening, Lane};
+use crate::event::{Delivery, EventPayload, FleetEvent};
 
 type Logged = Result<(), RecordingStreamError>;
 
@@ -68,13 +68,13 @@ impl EventLog {
         if let Some(layout) = self.layout.learn(event) {
             layout.send(&self.stream)?;
         }
-        match &event.happening {
-            Happening::Map { map, .. } => self.stream.log_static("track/map", &grid(map)),
-            Happening::Message {
+        match &event.payload {
+            EventPayload::Map { map, .. } => self.stream.log_static("track/map", &grid(map)),
+            EventPayload::Message {
                 topic,
                 header,
                 telemetry,
-                lane,
+                delivery,
                 ..
             } => {
                 let at = if header.sensor == 0 {
@@ -85,14 +85,14 @@ impl EventLog {
                 let Some(drawn) = self.cars.get_mut(car) else {
                     return Ok(());
                 };
-                drawn.live |= *lane == Lane::Live;
-                if (drawn.live && *lane == Lane::Complete) || !drawn.due(*topic, at) {
+                drawn.live |= *delivery == Delivery::Live;
+                if (drawn.live && *delivery == Delivery::InOrder) || !drawn.due(*topic, at) {
                     return Ok(());
                 }
                 self.stream.set_timestamp_nanos_since_epoch("time", at);
                 draw(&self.stream, car, drawn, at, telemetry)
             }
-            Happening::Marker { who, text } => {
+            EventPayload::Marker { who, text } => {
                 self.stream.set_timestamp_nanos_since_epoch("time", event.at);
                 let line = TextLog::new(format!("{text} [{who}]")).with_level(TextLogLevel::INFO);
                 self.stream.log(format!("events/{car}"), &line)
@@ -118,10 +118,10 @@ impl EventLog {
                 .with_names([car.as_str()]);
             self.stream.log_static(curve(what, car), &line)?;
         }
-        let lane = StateConfiguration::new()
+        let delivery = StateConfiguration::new()
             .with_values(STATES.map(|(state, _)| state))
             .with_colors(STATES.map(|(_, [r, g, b])| Color::from_rgb(r, g, b)));
-        self.stream.log_static(format!("lanes/{car}/state"), &lane)?;
+        self.stream.log_static(format!("lanes/{car}/state"), &delivery)?;
         let outline = Boxes3D::from_centers_and_half_sizes([[0.16, 0.0, 0.08]], [[0.26, 0.14, 0.08]])
             .with_colors([colour])
             .with_labels([car.as_str()]);
@@ -246,16 +246,16 @@ fn draw_health(stream: &RecordingStream, car: &CarName, health: &Health) -> Logg
 
 /// Every set that comes up gets a colour, the same for all cars.
 fn draw_set(stream: &RecordingStream, car: &CarName, drawn: &mut Drawn, params: &Params) -> Logged {
-    let lane = format!("lanes/{car}/set");
+    let delivery = format!("lanes/{car}/set");
     let name = params.set.name.as_str();
     if drawn.sets.insert(name.to_owned()) {
         let mut names: Vec<&str> = drawn.sets.iter().map(String::as_str).collect();
         names.sort_unstable();
         let colours: Vec<Color> = names.iter().map(|name| colour_of_set(name)).collect();
         let sets = StateConfiguration::new().with_values(names).with_colors(colours);
-        stream.log_static(lane.clone(), &sets)?;
+        stream.log_static(delivery.clone(), &sets)?;
     }
-    stream.log(lane, &StateChange::single(name))
+    stream.log(delivery, &StateChange::single(name))
 }
 
 fn particles(cloud: &Cloud, colour: Color) -> Points3D {
@@ -357,13 +357,13 @@ mod tests {
     use rerun::RecordingStreamBuilder;
     use rerun::log::{Chunk, LogMsg};
 
-    fn message(topic: Topic, lane: Lane, at: i64, telemetry: Telemetry) -> FleetEvent {
+    fn message(topic: Topic, delivery: Delivery, at: i64, telemetry: Telemetry) -> FleetEvent {
         FleetEvent {
             at,
             car: "car-1".parse().expect("a name"),
-            happening: Happening::Message {
+            payload: EventPayload::Message {
                 topic,
-                lane,
+                delivery,
                 header: Header::new(
                     Schema::Pose,
                     1,
@@ -420,7 +420,7 @@ mod tests {
 
     #[test]
     fn ten_seconds_at_full_rate_are_decimated() {
-        let events = (0..1000).map(|i| message(Topic::Pose, Lane::Live, i * SECOND / 100, pose()));
+        let events = (0..1000).map(|i| message(Topic::Pose, Delivery::Live, i * SECOND / 100, pose()));
         let rows = rows(events);
         assert_eq!(rows["/track/car-1/body"], 200, "{rows:?}");
         assert_eq!(rows["/plots/speed/car-1"], 200);
@@ -429,17 +429,19 @@ mod tests {
 
     #[test]
     fn what_the_recorder_gets_once_more_is_drawn_once() {
-        let twice =
-            |i| [Lane::Live, Lane::Complete].map(|lane| message(Topic::Pose, lane, i * SECOND, pose()));
+        let twice = |i| {
+            [Delivery::Live, Delivery::InOrder]
+                .map(|delivery| message(Topic::Pose, delivery, i * SECOND, pose()))
+        };
         assert_eq!(rows((0..10).flat_map(twice))["/track/car-1/body"], 10);
-        let replayed = (0..10).map(|i| message(Topic::Pose, Lane::Complete, i * SECOND, pose()));
+        let replayed = (0..10).map(|i| message(Topic::Pose, Delivery::InOrder, i * SECOND, pose()));
         assert_eq!(rows(replayed)["/track/car-1/body"], 10);
     }
 
     #[test]
     fn a_replay_that_jumps_back_is_drawn_on() {
         let times = [50, 51, 52, 10, 11];
-        let events = times.map(|s| message(Topic::Pose, Lane::Complete, s * SECOND, pose()));
+        let events = times.map(|s| message(Topic::Pose, Delivery::InOrder, s * SECOND, pose()));
         let rows = rows(events);
         assert_eq!(rows["/track/car-1/body"], 5);
         assert_eq!(rows["/track/car-1/trail"], 5);

@@ -1,0 +1,261 @@
+//! The running pit wall: a connection whose events update a fleet and fill a recording on request.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::Receiver;
+use protocol::CarName;
+use tokio::task::JoinHandle;
+
+use crate::clock::unix_now;
+use crate::event::{EventPayload, FleetEvent};
+use crate::event_bus::{EventBus, FleetGuard};
+use crate::fleet::Fleet;
+use crate::network::gap_recovery::Outstanding;
+use crate::network::{Client, Connection, ConnectionError, Role};
+use crate::recording::{Recorder, RecorderStatus, RecordingError, RecordingSummary};
+
+/// A running pit wall. Cheap to share.
+pub struct FleetService {
+    connection: Connection,
+    bus: Arc<EventBus>,
+    periodic_tasks: Mutex<Option<JoinHandle<()>>>,
+    /// Cars whose map and info are being fetched. Over a slow link a fetch takes longer than the period of the fetches.
+    fetching: Mutex<BTreeSet<CarName>>,
+}
+
+impl FleetService {
+    /// Period of [`Fleet::tick`].
+    const TICK: Duration = Duration::from_millis(100);
+    /// Period of the link reports to the cars.
+    const REPORT_LINKS: Duration = Duration::from_secs(1);
+    /// Period of the clock comparisons.
+    const COMPARE_CLOCKS: Duration = Duration::from_secs(2);
+    /// The final sync of a recording ends when nothing has arrived for this long.
+    const FINAL_SYNC_QUIET: Duration = Duration::from_millis(1500);
+    /// The final sync of a recording takes this long at most.
+    const FINAL_SYNC_MAX: Duration = Duration::from_secs(15);
+
+    /// Opens the connection. Needs a multi-thread tokio runtime.
+    pub async fn open(role: &Role) -> Result<Arc<Self>, ConnectionError> {
+        let bus = Arc::new(EventBus::default());
+        let sink = bus.clone();
+        let connection = Connection::open(role, Arc::new(move |event| sink.publish(event))).await?;
+        let service = Arc::new(Self {
+            connection,
+            bus,
+            periodic_tasks: Mutex::default(),
+            fetching: Mutex::default(),
+        });
+        let task = tokio::spawn(run_periodic_tasks(Arc::downgrade(&service)));
+        *service
+            .periodic_tasks
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = Some(task);
+        Ok(service)
+    }
+
+    /// The connection to the cars.
+    pub fn connection(&self) -> &Connection {
+        &self.connection
+    }
+
+    /// Sends queries and commands to the cars.
+    pub fn client(&self) -> &Client {
+        self.connection.client()
+    }
+
+    /// Locks the fleet. Hold the lock briefly: incoming events wait for it.
+    pub fn fleet(&self) -> FleetGuard<'_> {
+        self.bus.fleet()
+    }
+
+    /// Distributes the events.
+    pub fn bus(&self) -> &Arc<EventBus> {
+        &self.bus
+    }
+
+    /// Every event from now on, preceded by the current state. A receiver that reads too slowly misses events.
+    pub fn subscribe(&self) -> Receiver<Arc<FleetEvent>> {
+        self.bus.subscribe(unix_now())
+    }
+
+    /// Waits until a car is connected; false when it is not within `timeout`.
+    pub async fn wait_for(&self, car: &CarName, timeout: Duration) -> bool {
+        self.wait_until(timeout, |fleet| fleet.car(car).is_some_and(|car| car.alive))
+            .await
+    }
+
+    /// Waits until the fleet meets `condition`; false when it does not within `timeout`.
+    pub async fn wait_until(&self, timeout: Duration, condition: impl Fn(&Fleet) -> bool) -> bool {
+        let deadline = Instant::now() + timeout;
+        loop {
+            if condition(&self.fleet()) {
+                return true;
+            }
+            if Instant::now() >= deadline {
+                return false;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
+    /// Starts a recording of all cars. It begins with the known maps, info and clock offsets.
+    pub async fn start_recording(&self, path: &Path) -> Result<(), StartRecordingError> {
+        if self.bus.recorder().is_some() {
+            return Err(StartRecordingError::Recording);
+        }
+        let recorder = Recorder::start(path)?;
+        for event in self.bus.current_state(unix_now()) {
+            recorder.record(&Arc::new(event));
+        }
+        *self.bus.recorder() = Some(recorder);
+        self.connection.subscribe_recorded(true).await?;
+        Ok(())
+    }
+
+    /// Ends the recording and returns what is in it; None when nothing was being recorded. A final sync with every car
+    /// comes first, so that all of its streams end at the same moment.
+    pub async fn stop_recording(&self) -> Option<Result<RecordingSummary, RecordingError>> {
+        self.recording_path()?;
+        self.await_final_sync().await;
+        self.cut_recording().await
+    }
+
+    /// Ends the recording without a final sync and returns what is in it; None when nothing was being recorded.
+    pub async fn cut_recording(&self) -> Option<Result<RecordingSummary, RecordingError>> {
+        // Messages held back behind a gap are recorded first.
+        if let Err(error) = self.connection.subscribe_recorded(false).await {
+            tracing::warn!(%error, "still subscribed to the full-rate topics");
+        }
+        let recorder = self.bus.recorder().take()?;
+        tokio::task::spawn_blocking(move || recorder.finish()).await.ok()
+    }
+
+    async fn await_final_sync(&self) {
+        let mut outstanding = self.connection.final_sync();
+        let begun = Instant::now();
+        let (mut progressed, mut least) = (begun, Outstanding::UNKNOWN);
+        loop {
+            match *outstanding.borrow_and_update() {
+                Outstanding::NOTHING => return,
+                less if less < least => (progressed, least) = (Instant::now(), less),
+                _ => {}
+            }
+            let left = Self::FINAL_SYNC_QUIET.saturating_sub(progressed.elapsed());
+            let left = left.min(Self::FINAL_SYNC_MAX.saturating_sub(begun.elapsed()));
+            match tokio::time::timeout(left, outstanding.changed()).await {
+                Ok(Ok(())) => {}
+                Ok(Err(_)) | Err(_) => return,
+            }
+        }
+    }
+
+    /// The state of the recording; None when nothing is being recorded.
+    pub fn recording(&self) -> Option<RecorderStatus> {
+        self.bus.recorder().as_ref().map(Recorder::status)
+    }
+
+    /// The file that is being recorded.
+    pub fn recording_path(&self) -> Option<PathBuf> {
+        let recorder = self.bus.recorder();
+        recorder.as_ref().map(|recorder| recorder.path().to_owned())
+    }
+
+    /// Marks this moment in the log and the recording.
+    pub fn mark(&self, car: &CarName, who: &str, text: &str) {
+        self.client().emit(
+            car,
+            EventPayload::Marker {
+                who: who.into(),
+                text: text.into(),
+            },
+        );
+    }
+
+    /// Ends the recording, if there is one, and closes the connection.
+    pub async fn close(&self) {
+        if let Some(task) = self
+            .periodic_tasks
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take()
+        {
+            task.abort();
+        }
+        if let Some(Err(error)) = self.stop_recording().await {
+            tracing::error!(%error, "the recording could not be completed");
+        }
+        self.connection.close().await;
+    }
+}
+
+/// Ticks the fleet, reports links to the cars, compares clocks, and fetches maps and info.
+async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
+    let mut ticks = tokio::time::interval(FleetService::TICK);
+    let mut compared: Option<Instant> = None;
+    let mut reported: Option<Instant> = None;
+    loop {
+        ticks.tick().await;
+        let Some(service) = service.upgrade() else {
+            return;
+        };
+        let cars: Vec<_> = {
+            let mut fleet = service.fleet();
+            fleet.tick(unix_now());
+            let alive = fleet.cars().filter(|car| car.alive);
+            alive
+                .map(|car| (car.name.clone(), car.map.is_none(), car.info.is_none()))
+                .collect()
+        };
+        if reported.is_none_or(|at| at.elapsed() >= FleetService::REPORT_LINKS) {
+            reported = Some(Instant::now());
+            let now = unix_now();
+            let reports: Vec<_> = service
+                .fleet()
+                .cars()
+                .filter_map(|car| Some((car.name.clone(), car.link_report(now)?)))
+                .collect();
+            for (car, report) in reports {
+                service.client().report(&car, &report).await;
+            }
+        }
+        let compare = compared.is_none_or(|at| at.elapsed() >= FleetService::COMPARE_CLOCKS);
+        if compare && !cars.is_empty() {
+            compared = Some(Instant::now());
+            for (car, map, info) in cars {
+                let service = service.clone();
+                tokio::spawn(async move {
+                    service.client().compare_clocks(&car).await;
+                    let fetching = || service.fetching.lock().unwrap_or_else(PoisonError::into_inner);
+                    if !(info || map) || !fetching().insert(car.clone()) {
+                        return;
+                    }
+                    if info {
+                        service.client().fetch_info(&car).await;
+                    }
+                    if map {
+                        service.client().fetch_map(&car).await;
+                    }
+                    fetching().remove(&car);
+                });
+            }
+        }
+    }
+}
+
+/// Why a recording cannot be started.
+#[derive(Debug, thiserror::Error)]
+pub enum StartRecordingError {
+    /// One is running already.
+    #[error("a recording is already running")]
+    Recording,
+    /// The file.
+    #[error(transparent)]
+    File(#[from] RecordingError),
+    /// The network.
+    #[error(transparent)]
+    Connection(#[from] ConnectionError),
+}

@@ -1,0 +1,190 @@
+//! The connection to the cars: a zenoh session and its subscriptions.
+//!
+//! The pit wall opens a router in its own process and the cars dial it, so that no daemon is needed. A second program
+//! on the same laptop joins that router as a client. zenoh's threads only note when a message arrived and queue it,
+//! because a slow callback loses messages. The decoder's thread does the rest.
+
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use crossbeam_channel::Sender;
+use protocol::{Key, Topic};
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::task::JoinHandle;
+use zenoh::pubsub::Subscriber;
+use zenoh::sample::{Sample, SampleKind};
+
+use super::client::Client;
+use super::decoder::{Decoder, DecoderInput, send_missing_queries};
+use super::error::ConnectionError;
+use super::gap_recovery::Outstanding;
+use super::role::Role;
+use crate::clock::unix_now;
+use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
+
+/// Messages that may wait to be decoded: some ten seconds of twenty cars.
+const QUEUE: usize = 100_000;
+
+/// A connection to the cars.
+pub struct Connection {
+    session: zenoh::Session,
+    client: Client,
+    inputs: Sender<DecoderInput>,
+    _live: Vec<Box<dyn Send + Sync>>,
+    recorded: Mutex<Vec<Subscriber<()>>>,
+    missing_queries: JoinHandle<()>,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        self.missing_queries.abort();
+    }
+}
+
+impl Connection {
+    /// Opens the connection and subscribes to every topic but the full-rate ones ([`Connection::subscribe_recorded`]).
+    /// Needs a multi-thread tokio runtime. `sink` receives every event.
+    pub async fn open(role: &Role, sink: EventSink) -> Result<Self, ConnectionError> {
+        let session = zenoh::open(role.config()?)
+            .await
+            .map_err(|e| role.open_error(&e))?;
+        let (inputs, queue) = crossbeam_channel::bounded(QUEUE);
+        let (answers, answered) = crossbeam_channel::unbounded();
+        let (queries, queued) = mpsc::unbounded_channel();
+        let decoder = Decoder::new(sink.clone(), queries);
+        std::thread::Builder::new()
+            .name("decode".to_owned())
+            .spawn(move || decoder.run(&queue, &answered))
+            .map_err(ConnectionError::Thread)?;
+        let missing_queries = tokio::spawn(send_missing_queries(session.clone(), queued, answers));
+        let mut live: Vec<Box<dyn Send + Sync>> = Vec::new();
+        for topic in Topic::all() {
+            let delivery = match topic {
+                Topic::Alive => {
+                    live.push(Box::new(watch_liveliness(&session, &sink, &inputs).await?));
+                    continue;
+                }
+                // The newest message counts, so each is forwarded as it comes. Missing health messages follow late.
+                Topic::Pose
+                | Topic::Cloud
+                | Topic::Scan
+                | Topic::Health
+                | Topic::Load
+                | Topic::Params
+                | Topic::Shadow => Delivery::Live,
+                Topic::Event => Delivery::InOrder,
+                _ => continue,
+            };
+            live.push(Box::new(subscribe(&session, topic, delivery, &inputs).await?));
+        }
+        Ok(Self {
+            client: Client::new(session.clone(), sink),
+            session,
+            inputs,
+            _live: live,
+            recorded: Mutex::default(),
+            missing_queries,
+        })
+    }
+
+    /// Sends queries and commands to the cars.
+    pub fn client(&self) -> &Client {
+        &self.client
+    }
+
+    /// Starts or ends the subscriptions to the full-rate topics. At the end, held-back messages have been forwarded when
+    /// this returns.
+    pub async fn subscribe_recorded(&self, on: bool) -> Result<(), ConnectionError> {
+        let mut subscribers = Vec::new();
+        if on {
+            for topic in Topic::all().filter(|topic| topic.recorded()) {
+                subscribers.push(subscribe(&self.session, topic, Delivery::InOrder, &self.inputs).await?);
+            }
+        }
+        let (done, forwarded) = oneshot::channel();
+        // When the queue is full or closed there is nothing to wait for.
+        self.inputs.try_send(DecoderInput::WantRecorded(on, done)).ok();
+        forwarded.await.ok();
+        let before = std::mem::replace(
+            &mut *self.recorded.lock().unwrap_or_else(PoisonError::into_inner),
+            subscribers,
+        );
+        drop(before);
+        Ok(())
+    }
+
+    /// Queries every car for the ends of its streams ([`EventPayload::StreamEnds`]) and for all that it has sent by then.
+    /// Returns what is still outstanding.
+    pub(crate) fn final_sync(&self) -> watch::Receiver<Outstanding> {
+        let (progress, outstanding) = watch::channel(Outstanding::UNKNOWN);
+        // When the queue is full or closed, `progress` is dropped, and the receiver sees that.
+        self.inputs.try_send(DecoderInput::FinalSync(progress)).ok();
+        outstanding
+    }
+
+    /// Closes the zenoh session. Gives up after two seconds, because closing takes longer when the network is down.
+    pub async fn close(&self) {
+        let closing = async { self.session.close().await };
+        if tokio::time::timeout(Duration::from_secs(2), closing)
+            .await
+            .is_err()
+        {
+            tracing::warn!("the network did not confirm that the connection is closed");
+        }
+    }
+}
+
+async fn watch_liveliness(
+    session: &zenoh::Session,
+    sink: &EventSink,
+    inputs: &Sender<DecoderInput>,
+) -> Result<impl Send + Sync + use<>, ConnectionError> {
+    let sink = sink.clone();
+    let inputs = inputs.clone();
+    let key = Topic::Alive.of_all_cars();
+    session
+        .liveliness()
+        .declare_subscriber(&key)
+        .history(true)
+        .callback(move |sample| {
+            let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                return;
+            };
+            let payload = match sample.kind() {
+                SampleKind::Put => {
+                    // When the queue is full, messages of the car reveal it anyway.
+                    inputs.try_send(DecoderInput::Appeared(key.car.clone())).ok();
+                    EventPayload::Appeared
+                }
+                SampleKind::Delete => EventPayload::Vanished,
+            };
+            sink(FleetEvent {
+                at: unix_now(),
+                car: key.car,
+                payload,
+            });
+        })
+        .await
+        .map_err(|e| ConnectionError::subscribe(&key, &e))
+}
+
+async fn subscribe(
+    session: &zenoh::Session,
+    topic: Topic,
+    delivery: Delivery,
+    inputs: &Sender<DecoderInput>,
+) -> Result<Subscriber<()>, ConnectionError> {
+    let key = topic.of_all_cars();
+    let inputs = inputs.clone();
+    session
+        .declare_subscriber(&key)
+        .callback(move |sample: Sample| {
+            let at = unix_now();
+            let input = DecoderInput::Sample { at, delivery, sample };
+            if inputs.try_send(input).is_err() {
+                tracing::warn!("messages arrive faster than they can be decoded; some are lost");
+            }
+        })
+        .await
+        .map_err(|e| ConnectionError::subscribe(&key, &e))
+}

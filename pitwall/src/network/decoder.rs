@@ -1,0 +1,261 @@
+//! Decodes what arrives, on a thread of its own.
+//!
+//! Each message is decoded once and forwarded as a [`FleetEvent`]. [`GapRecovery`] puts the messages in order and finds
+//! the missing ones; a task queries the cars for those.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, Sender, select};
+use protocol::{CarName, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
+use tokio::sync::{mpsc, oneshot, watch};
+use zenoh::qos::Priority;
+use zenoh::sample::{Sample, SampleKind};
+
+use super::gap_recovery::{GapRecovery, MessageId, MissingQuery, Outstanding};
+use super::query::{first_reply, stamps};
+use crate::clock::unix_now;
+use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
+
+/// How often overdue messages and due queries are looked for.
+const TICK: Duration = Duration::from_millis(50);
+/// How long a car may take to send missing messages.
+const MISSING_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// An input of the decoder's thread.
+#[expect(clippy::large_enum_variant, reason = "nearly all of them are samples")]
+pub(super) enum DecoderInput {
+    /// A sample, with the time of its arrival [unix ns].
+    Sample {
+        at: i64,
+        delivery: Delivery,
+        sample: Sample,
+    },
+    /// A car's liveliness token has appeared.
+    Appeared(CarName),
+    /// The full-rate topics are wanted, or no longer. The sender hears when held-back messages have been forwarded.
+    WantRecorded(bool, oneshot::Sender<()>),
+    /// A recording is about to end. The sender hears what is still outstanding.
+    FinalSync(watch::Sender<Outstanding>),
+}
+
+/// The result of a query for missing messages.
+pub(super) struct MissingAnswer {
+    at: i64,
+    car: CarName,
+    /// None when the car did not answer.
+    reply: Option<(Header, MissingReply)>,
+}
+
+/// A message of a known car and topic.
+struct ReceivedMessage {
+    at: i64,
+    delivery: Delivery,
+    key: Key,
+    bytes: Arc<[u8]>,
+}
+
+/// Decodes messages and recovers missing ones.
+pub(super) struct Decoder {
+    recovery: GapRecovery<ReceivedMessage>,
+    sink: EventSink,
+    queries: mpsc::UnboundedSender<MissingQuery>,
+    /// Who waits for the end of a recording.
+    final_sync: Option<watch::Sender<Outstanding>>,
+}
+
+impl Decoder {
+    /// Events go to `sink`, queries for missing messages to `queries`.
+    pub(super) fn new(sink: EventSink, queries: mpsc::UnboundedSender<MissingQuery>) -> Self {
+        Self {
+            recovery: GapRecovery::default(),
+            sink,
+            queries,
+            final_sync: None,
+        }
+    }
+
+    /// Runs until the connection is closed.
+    pub(super) fn run(mut self, inputs: &Receiver<DecoderInput>, answers: &Receiver<MissingAnswer>) {
+        let mut ticked = Instant::now();
+        loop {
+            select! {
+                recv(inputs) -> input => match input {
+                    Ok(input) => self.handle(input),
+                    Err(_) => return,
+                },
+                // When this channel closes, so does the other.
+                recv(answers) -> answer => if let Ok(answer) = answer {
+                    self.handle_answer(answer);
+                    self.send_due_queries(unix_now());
+                },
+                default(TICK) => {}
+            }
+            if ticked.elapsed() >= TICK {
+                ticked = Instant::now();
+                let now = unix_now();
+                for received in self.recovery.overdue(now) {
+                    self.forward(received);
+                }
+                self.send_due_queries(now);
+                if let Some(progress) = &self.final_sync {
+                    progress.send_replace(self.recovery.outstanding());
+                }
+            }
+        }
+    }
+
+    fn send_due_queries(&mut self, now: i64) {
+        for query in self.recovery.due(now) {
+            // Fails only when the connection is being closed.
+            self.queries.send(query).ok();
+        }
+    }
+
+    fn handle(&mut self, input: DecoderInput) {
+        match input {
+            DecoderInput::Appeared(car) => self.recovery.appeared(&car),
+            DecoderInput::WantRecorded(on, done) => {
+                self.final_sync = None;
+                for received in self.recovery.want_recorded(on) {
+                    self.forward(received);
+                }
+                // The other side may have stopped waiting.
+                done.send(()).ok();
+            }
+            DecoderInput::FinalSync(progress) => {
+                let now = unix_now();
+                self.recovery.final_sync(now);
+                self.final_sync = Some(progress);
+                self.send_due_queries(now);
+            }
+            DecoderInput::Sample { at, delivery, sample } => {
+                if sample.kind() != SampleKind::Put {
+                    return;
+                }
+                // A foreign key names no car to count it for.
+                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                    tracing::debug!(key = %sample.key_expr(), "ignored a sample under a foreign key");
+                    return;
+                };
+                let bytes = sample.payload().to_bytes().into();
+                self.handle_message(ReceivedMessage {
+                    at,
+                    delivery,
+                    key,
+                    bytes,
+                });
+            }
+        }
+    }
+
+    fn handle_message(&mut self, received: ReceivedMessage) {
+        let header = Header::read(&received.bytes);
+        let (Ok(header), true) = (header, received.key.topic.recovered()) else {
+            return self.forward(received);
+        };
+        let id = MessageId {
+            topic: received.key.topic,
+            run_id: header.run_id,
+            number: header.sequence,
+        };
+        let (car, at) = (received.key.car.clone(), received.at);
+        for received in self.recovery.arrive(&car, id, received, at) {
+            self.forward(received);
+        }
+    }
+
+    fn handle_answer(&mut self, MissingAnswer { at, car, reply }: MissingAnswer) {
+        let Some((header, MissingReply { streams, messages })) = reply else {
+            return self.recovery.unanswered(&car, at);
+        };
+        let more = !messages.is_empty();
+        for Resent { topic, bytes } in messages {
+            self.handle_message(ReceivedMessage {
+                at,
+                delivery: Delivery::InOrder,
+                key: Key::new(car.clone(), topic),
+                bytes: bytes.into(),
+            });
+        }
+        let (released, stream_ends) = self.recovery.answered(&car, header.run_id, &streams, more, at);
+        if let Some(outstanding) = stream_ends {
+            (self.sink)(FleetEvent {
+                at,
+                car,
+                payload: EventPayload::StreamEnds {
+                    run_id: header.run_id,
+                    published: header.published,
+                    outstanding,
+                },
+            });
+        }
+        for received in released {
+            self.forward(received);
+        }
+    }
+
+    /// Decodes a message and sends the event.
+    fn forward(&self, received: ReceivedMessage) {
+        let ReceivedMessage {
+            at,
+            delivery,
+            key,
+            bytes,
+        } = received;
+        let payload = match Telemetry::decode(key.topic, &bytes) {
+            Some(Ok((header, telemetry))) => EventPayload::Message {
+                topic: key.topic,
+                delivery,
+                header,
+                telemetry: Box::new(telemetry),
+                bytes,
+            },
+            Some(Err(error)) => EventPayload::Unreadable {
+                topic: key.topic,
+                header: Header::read(&bytes).ok(),
+                error: error.to_string(),
+            },
+            None => return,
+        };
+        (self.sink)(FleetEvent {
+            at,
+            car: key.car,
+            payload,
+        });
+    }
+}
+
+/// Sends the queries for missing messages, until the decoder has ended.
+pub(super) async fn send_missing_queries(
+    session: zenoh::Session,
+    mut queries: mpsc::UnboundedReceiver<MissingQuery>,
+    answers: Sender<MissingAnswer>,
+) {
+    while let Some(query) = queries.recv().await {
+        let (session, answers) = (session.clone(), answers.clone());
+        tokio::spawn(async move {
+            let car = query.car.clone();
+            let reply = query_missing(&session, query).await;
+            let at = unix_now();
+            // Fails only when the connection is closed.
+            answers.send(MissingAnswer { at, car, reply }).ok();
+        });
+    }
+}
+
+/// Queries a car for missing messages. None without a reply in time.
+async fn query_missing(session: &zenoh::Session, query: MissingQuery) -> Option<(Header, MissingReply)> {
+    // Before what can wait, after what an operator waits for.
+    let priority = if query.urgent {
+        Priority::DataHigh
+    } else {
+        Priority::Data
+    };
+    let (car, topic) = (&query.car, Topic::Missing);
+    let request = encode(&query.request, stamps()).ok()?;
+    let bytes = first_reply(session, car, topic, request, MISSING_TIMEOUT, priority).await?;
+    decode::<MissingReply>(&bytes)
+        .inspect_err(|error| tracing::debug!(%car, %error, "the reply cannot be decoded"))
+        .ok()
+}

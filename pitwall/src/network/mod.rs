@@ -1,0 +1,27 @@
+//! The network side: the only modules that name zenoh.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `role.rs` | router or client, and the zenoh configuration of each |
+//! | `connection.rs` | opens the zenoh session and subscribes |
+//! | `decoder.rs` | a thread that decodes messages, puts them in order and finds gaps |
+//! | `gap_recovery/` | which messages are missing and when to query for them; pure |
+//! | `query.rs` | one query to a car |
+//! | `client.rs` | queries and commands to a car |
+//! | `verdict.rs` | the outcome of a command |
+
+mod client;
+mod connection;
+mod decoder;
+mod error;
+pub(crate) mod gap_recovery;
+mod query;
+mod role;
+mod verdict;
+
+pub use client::{Client, REPLY_TIMEOUT, new_command_id};
+pub use connection::Connection;
+pub use error::ConnectionError;
+pub(crate) use role::endpoint;
+pub use role::{DEFAULT_LISTEN, LOCAL_PITWALL, Role};
+pub use verdict::Verdict;

@@ -1,0 +1,3 @@
+//! Empty: without it Cargo leaves build dependencies out.
+
+fn main() {}

@@ -17,7 +17,7 @@ use std::fmt;
 use maps::Pose;
 
 pub use hand_over::{HandOver, HandedEstimate};
-pub use parameters::{ParameterFault, ParameterValues, PreparedParameters};
+pub use parameters::{ParameterFault, ParameterValues, PreparedParameters, overlay, to_values};
 pub use sensors::{Odometry, Scan, Twist, YawRate};
 pub use stamp::Stamp;
 pub use update::{Dropped, Hypothesis, Mode, Update, WeightedPose};

@@ -26,6 +26,7 @@ mod quality;
 mod range_table;
 mod ranges;
 mod recovery;
+mod reference;
 mod regions;
 mod resampling;
 mod scan_matcher;
@@ -50,8 +51,11 @@ pub use localizer::{
 };
 pub use loss_detector::RecoveryParameters;
 pub use motion_model::{MotionModel, MotionParameters};
-pub use parameters::Parameters;
+pub use parameters::{Parameters, parameter_table};
 pub use particles::ParticleParameters;
+pub use reference::{
+    Reference, ReferenceDefects, ReferenceMotionModel, ReferenceParameters, ReferenceTuning,
+};
 pub use scan_matcher::RefinementParameters;
 pub use search::SearchParameters;
 pub use sensor_parameters::{RangeMethod, SensorModelKind, SensorParameters};

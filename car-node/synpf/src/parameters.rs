@@ -6,12 +6,10 @@
 mod reference;
 mod sets;
 
-use std::collections::BTreeMap;
-
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use localizer::ParameterFault;
+use localizer::{ParameterFault, ParameterValues};
 
 use crate::beam_layout::BeamParameters;
 use crate::defects::Defects;
@@ -62,73 +60,28 @@ impl Parameters {
     }
 
     /// The set as flat keys and values, sorted by key.
-    pub fn to_values(&self) -> BTreeMap<String, Value> {
-        match serde_json::to_value(self) {
-            Ok(Value::Object(values)) => values.into_iter().collect(),
-            _ => unreachable!("a parameter set is a flat table of numbers, names and flags"),
-        }
+    pub fn to_values(&self) -> ParameterValues {
+        localizer::to_values(self)
     }
 
-    /// This set with some values replaced. Returns the keys that mean nothing here beside it, for the caller to
-    /// warn of or to refuse. Every fault is listed, not just the first.
+    /// This set with some values replaced, and the keys that are unknown. Every fault is listed.
     pub fn with_values(
         &self,
         given: impl IntoIterator<Item = (String, Value)>,
     ) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
-        let base = self.to_values();
-        let (mut values, mut unknown, mut faults) = (base.clone(), Vec::new(), Vec::new());
-        for (key, value) in given {
-            if !base.contains_key(&key) {
-                unknown.push(key);
-                continue;
-            }
-            // Each value alone on top of a sound set, so that a fault names its key.
-            let mut one = base.clone();
-            one.insert(key.clone(), value.clone());
-            match from_values(one) {
-                Ok(_) => {
-                    values.insert(key, value);
-                }
-                Err(e) => faults.push(ParameterFault {
-                    fault: format!("{value}: {e}"),
-                    key,
-                }),
-            }
-        }
-        let set = match from_values(values) {
-            Ok(set) if faults.is_empty() => set,
-            Ok(_) => return Err(faults),
-            Err(e) => {
-                faults.push(ParameterFault {
-                    key: "set".into(),
-                    fault: e.to_string(),
-                });
-                return Err(faults);
-            }
-        };
-        set.validate()?;
-        Ok((set, unknown))
+        localizer::overlay(self, given, Self::validate)
     }
 
-    /// Reads a flat YAML file: our own keys, or those of the reference's `pf2_params.yaml` (bare, or under
-    /// `<node>: ros__parameters:`). Keys not given keep the value they have in `hq`; a file that gives only
-    /// `max_particles` lowers `min_particles` with it. Returns the set and the keys that mean nothing here, for a
-    /// warning. Faults are listed whole.
+    /// Reads a flat YAML file; see [`parameter_table`] and [`Self::from_table`].
     pub fn from_yaml(text: &str) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
-        let file: Value = serde_saphyr::from_str(text).map_err(|e| {
-            vec![ParameterFault {
-                key: "file".into(),
-                fault: e.without_snippet().to_string(),
-            }]
-        })?;
-        let Some(given) = reference::parameter_table(&file) else {
-            let fault = "should be a table of keys and values".to_owned();
-            return Err(vec![ParameterFault {
-                key: "file".into(),
-                fault,
-            }]);
-        };
-        let mut base = Self::named("hq").expect("hq ships");
+        Self::from_table(parameter_table(text)?)
+    }
+
+    /// A set from a table of our own keys, or of those of the reference's `pf2_params.yaml`. Keys not given keep the value
+    /// they have in `hq`; a table that gives only `max_particles` lowers `min_particles` with it. Returns the set and the
+    /// keys that are unknown, for a warning. Faults are listed whole.
+    pub fn from_table(given: ParameterValues) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
+        let mut base = Self::default();
         if let Some(most) = given.get("max_particles").and_then(Value::as_u64)
             && !given.contains_key("min_particles")
         {
@@ -155,8 +108,18 @@ impl Parameters {
     }
 }
 
-fn from_values(values: BTreeMap<String, Value>) -> serde_json::Result<Parameters> {
-    serde_json::from_value(Value::Object(values.into_iter().collect()))
+/// The parameters in a flat YAML file: bare keys, or under `<node>: ros__parameters:`.
+pub fn parameter_table(text: &str) -> Result<ParameterValues, Vec<ParameterFault>> {
+    let fault = |fault: String| {
+        vec![ParameterFault {
+            key: "file".into(),
+            fault,
+        }]
+    };
+    let file: Value = serde_saphyr::from_str(text).map_err(|e| fault(e.without_snippet().to_string()))?;
+    reference::parameter_table(&file)
+        .map(|table| table.clone().into_iter().collect())
+        .ok_or_else(|| fault("should be a table of keys and values".into()))
 }
 
 #[cfg(test)]

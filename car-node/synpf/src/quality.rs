@@ -41,17 +41,27 @@ impl Quality {
     /// Judges a scan at a pose in the grid's frame. Beams that end where nothing was mapped ([`TrackMap::unmapped`]) are not
     /// valid: they say nothing on the pose. At most half of a scan is excused so.
     pub(crate) fn new(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> Self {
+        Self::of_points(map, &scan.points, scan.base_link_from_laser, pose)
+    }
+
+    /// The same for end points in the frame of `base_link` [m].
+    pub(crate) fn of_points(
+        map: &TrackMap,
+        points: &[[f32; 2]],
+        base_link_from_laser: Pose,
+        pose: Pose,
+    ) -> Self {
         let field = map.field();
         let cells = 1.0 / field.resolution() as f32;
-        let stride = scan.points.len().div_ceil(BEAMS).max(1);
+        let stride = points.len().div_ceil(BEAMS).max(1);
         let (sin, cos) = pose.heading.sin_cos();
         let (sin, cos) = (sin as f32, cos as f32);
         let (x, y) = (pose.x as f32, pose.y as f32);
-        let laser = pose * scan.base_link_from_laser;
+        let laser = pose * base_link_from_laser;
         let (lx, ly) = (laser.x as f32, laser.y as f32);
         let (mut count, mut aligned, mut residual, mut unmapped) = (0.0f32, 0.0f32, 0.0f32, 0.0f32);
         let (mut cast, mut short, mut long) = (0.0f32, 0.0f32, 0.0f32);
-        for (k, point) in scan.points.iter().step_by(stride).enumerate() {
+        for (k, point) in points.iter().step_by(stride).enumerate() {
             let (px, py) = (
                 x + cos * point[0] - sin * point[1],
                 y + sin * point[0] + cos * point[1],

@@ -7,6 +7,7 @@ use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 use crate::cddt::Cddt;
 use crate::error::SetUpError;
 use crate::range_table::{RangeTable, TableParameters};
+use crate::reference::RangeTables;
 use crate::regions::{NOWHERE, Region, regions};
 use crate::seed::Blurred;
 use crate::table_store::{Table, TableJob, TableKey, TablePolicy, TableStore};
@@ -26,6 +27,7 @@ pub struct TrackMap {
     region_of: Vec<u16>,
     tables: TableStore,
     blurred: OnceLock<Blurred>,
+    reference_tables: RangeTables,
 }
 
 /// A track is nowhere wider than twice this; what is wider lies beside it [m].
@@ -58,6 +60,7 @@ impl TrackMap {
             region_of,
             tables: TableStore::default(),
             blurred: OnceLock::new(),
+            reference_tables: RangeTables::default(),
         })
     }
 
@@ -110,9 +113,14 @@ impl TrackMap {
         self.tables.build(job.0, || self.new_table(job.0));
     }
 
+    /// What the reference looks up.
+    pub(crate) fn reference_tables(&self) -> &RangeTables {
+        &self.reference_tables
+    }
+
     /// Memory that the tables take [bytes].
     pub fn table_bytes(&self) -> usize {
-        self.tables.bytes()
+        self.tables.bytes() + self.reference_tables.bytes()
     }
 
     /// Memory that a table takes [bytes], known before it is built: exact for range tables, an upper bound for the CDDT.

@@ -7,12 +7,13 @@ use std::sync::{Arc, OnceLock};
 
 use car_node::evaluate::{self, Fault, FaultReport, Outcome, Start, Truth};
 use car_node::health::State;
+use car_node::localization::LocalizerParameters;
 use car_node::sensors::bag::{Arrival, SensorEvent, SensorLog, Topics};
 use car_node::sensors::frames::Mount;
 use car_node::sensors::{Feed, Next, PoseEstimate, Race, Source};
 use maps::{Cell, OccupancyGrid, Pose};
 use simulator::{CarSetup, Guidance, Surface, Track, Wall, Walls};
-use synpf::{Localizer, Parameters, SynPf, TrackMap};
+use synpf::{Localizer, TrackMap};
 
 fn club() -> Track {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
@@ -76,9 +77,9 @@ fn sound() -> SensorLog {
     LOG.get_or_init(|| race(club(), &[], 20.0, 20.0)).clone()
 }
 
-fn localizer(map: &Arc<TrackMap>, mount: Mount) -> SynPf {
-    let hq = Parameters::named("hq").expect("ships");
-    SynPf::new(Arc::clone(map), mount.base_link_from_laser, hq, 7).expect("sound")
+fn localizer(map: &Arc<TrackMap>, mount: Mount) -> Box<dyn Localizer> {
+    let hq = LocalizerParameters::named("hq").expect("ships");
+    hq.build(map, mount.base_link_from_laser, 7).expect("sound")
 }
 
 /// What the state says over a log, from the true start moved by `off`.
@@ -87,7 +88,7 @@ fn judge(log: &SensorLog, grid: OccupancyGrid, off: Pose) -> Outcome {
     let mut localizer = localizer(&map, log.mount.expect("known"));
     let truth = Truth::new(log.truth.clone());
     let start = Start::Pose(log.truth[0].1 * off);
-    evaluate::run(&mut localizer, &log.arrivals, &truth, start, |_, _| ()).expect("runs")
+    evaluate::run(localizer.as_mut(), &log.arrivals, &truth, start, |_, _| ()).expect("runs")
 }
 
 fn judge_here(log: &SensorLog) -> Outcome {

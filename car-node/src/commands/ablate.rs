@@ -11,7 +11,7 @@ use car_node::sensors::frames::Mount;
 use car_node::statistics::mean;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use synpf::{SetUpError, SynPf, TrackMap};
+use synpf::{SetUpError, TrackMap};
 
 use crate::cli::Ablate;
 
@@ -118,9 +118,14 @@ fn over(
     start: Start,
     seed: u64,
 ) -> anyhow::Result<Outcome> {
-    let parameters = step.parameters.clone();
-    let mut localizer = SynPf::new(Arc::clone(map), mount.base_link_from_laser, parameters, seed)?;
-    Ok(run_over(&mut localizer, &log.arrivals, truth, start, |_, _| {})?)
+    let mut localizer = step.parameters.build(map, mount.base_link_from_laser, seed)?;
+    Ok(run_over(
+        localizer.as_mut(),
+        &log.arrivals,
+        truth,
+        start,
+        |_, _| {},
+    )?)
 }
 
 fn print_table(rows: &[Row], set: &str, seeds: usize) {
@@ -161,7 +166,7 @@ fn print_table(rows: &[Row], set: &str, seeds: usize) {
             value.map_or("-".into(), |value| format!("{:.digits$}", value * scale))
         };
         let lead = match row.change {
-            Change::None => "",
+            Change::None | Change::Replaced => "",
             Change::Added => "+ ",
             Change::LeftOut => "- ",
         };

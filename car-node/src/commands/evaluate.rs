@@ -12,7 +12,7 @@ use car_node::sensors::bag::SensorLog;
 use car_node::statistics::ErrorSummary;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use synpf::{SynPf, Update};
+use synpf::{Localizer, Update};
 
 use super::BadUsage;
 use crate::cli::Evaluate;
@@ -76,7 +76,7 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
         Start::Global => None,
     };
     let before = Instant::now();
-    map.prepare(place, &set.parameters);
+    set.parameters.prepare_tables(&map, place);
     let range_table = RangeTable {
         build_ms: before.elapsed().as_secs_f64() * 1e3,
         bytes: map.table_bytes(),
@@ -88,14 +88,9 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
         let truth = Truth::new(log.truth.clone());
         let mount = super::mount(bag, log);
         for &seed in &arguments.seed {
-            let localizer = SynPf::new(
-                Arc::clone(&map),
-                mount.base_link_from_laser,
-                set.parameters.clone(),
-                seed,
-            )?;
+            let mut localizer = set.parameters.build(&map, mount.base_link_from_laser, seed)?;
             let progress = progress_bar(bag, seed);
-            let outcome = over_bag(localizer, log, &truth, start, poses.as_mut(), &progress)
+            let outcome = over_bag(localizer.as_mut(), log, &truth, start, poses.as_mut(), &progress)
                 .with_context(|| bag.display().to_string())?;
             reports.push(Report {
                 bag: bag.into(),
@@ -144,7 +139,7 @@ fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
 }
 
 fn over_bag(
-    mut localizer: SynPf,
+    localizer: &mut dyn Localizer,
     log: &SensorLog,
     truth: &Truth,
     start: Start,
@@ -152,7 +147,7 @@ fn over_bag(
     progress: &ProgressBar,
 ) -> anyhow::Result<Outcome> {
     let mut failed = None;
-    let outcome = run_over(&mut localizer, &log.arrivals, truth, start, |update, done| {
+    let outcome = run_over(localizer, &log.arrivals, truth, start, |update, done| {
         if update.number.is_multiple_of(64) {
             progress.set_position((done * 1000.0) as u64);
         }

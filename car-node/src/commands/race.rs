@@ -5,13 +5,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
+use car_node::localization::LocalizerParameters;
 use car_node::race::{CarResult, PAPER_ROWS, PoseSource, Quality, RaceSetup, RaceSummary, SPEED_SCALE, race};
 use car_node::statistics::MeanSigma;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
 use simulator::{Track, TrackReport};
-use synpf::{Parameters, TrackMap};
+use synpf::TrackMap;
 
 use super::{find_track, load_set};
 use crate::cli;
@@ -71,7 +72,7 @@ fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, PoseSource)> {
             let set = load_set(&arguments.params)?;
             (
                 format!("synpf {}", set.name),
-                PoseSource::SynPf(Box::new(set.parameters)),
+                PoseSource::Localizer(set.parameters),
             )
         }
         cli::PoseSource::SynpfBaseline => shipped("synpf-baseline")?,
@@ -81,13 +82,13 @@ fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, PoseSource)> {
 }
 
 fn shipped(name: &str) -> anyhow::Result<(String, PoseSource)> {
-    let parameters = Parameters::named(name).with_context(|| format!("no parameter set {name}"))?;
+    let parameters = LocalizerParameters::named(name).with_context(|| format!("no parameter set {name}"))?;
     let title = if name.starts_with("synpf") {
         name.into()
     } else {
         format!("synpf {name}")
     };
-    Ok((title, PoseSource::SynPf(Box::new(parameters))))
+    Ok((title, PoseSource::Localizer(parameters)))
 }
 
 /// One race for each seed, side by side on the machine's cores.

@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use maps::MapError;
 use protocol::ValueChange;
 use serde_json::Value;
-use synpf::{ParameterFault, Parameters};
+use synpf::ParameterFault;
 
+use crate::localization::{KIND_KEY, LocalizerParameters};
 use crate::wire;
 
 /// A set as it was found.
@@ -16,8 +17,8 @@ pub struct NamedSet {
     /// The set's name: the shipped one's, or the file's without its extension.
     pub name: String,
     /// The values.
-    pub parameters: Parameters,
-    /// Keys in the file that mean nothing to this filter.
+    pub parameters: LocalizerParameters,
+    /// Keys in the file that the localizer does not know.
     pub unknown_keys: Vec<String>,
 }
 
@@ -25,7 +26,7 @@ pub struct NamedSet {
 #[derive(Debug, thiserror::Error)]
 pub enum SetError {
     /// Neither a shipped set nor a file.
-    #[error("no parameter set {0:?}: neither a file nor one of {names}", names = Parameters::NAMES.join(", "))]
+    #[error("no parameter set {0:?}: neither a file nor one of {names}", names = LocalizerParameters::NAMES.join(", "))]
     Unknown(String),
     /// The file does not read.
     #[error(transparent)]
@@ -42,7 +43,7 @@ pub enum SetError {
 
 /// The shipped set of that name, or else the YAML file at that path.
 pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
-    if let Some(parameters) = Parameters::named(name_or_path) {
+    if let Some(parameters) = LocalizerParameters::named(name_or_path) {
         return Ok(NamedSet {
             name: name_or_path.into(),
             parameters,
@@ -58,7 +59,7 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
         path: path.into(),
         faults,
     };
-    let (parameters, unknown_keys) = Parameters::from_yaml(&text).map_err(faulty)?;
+    let (parameters, unknown_keys) = LocalizerParameters::from_yaml(&text).map_err(faulty)?;
     parameters.validate().map_err(faulty)?;
     Ok(NamedSet {
         name: path
@@ -70,7 +71,7 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
 }
 
 /// The values in which two sets differ.
-pub fn changes(before: &Parameters, after: &Parameters) -> Vec<ValueChange> {
+pub fn changes(before: &LocalizerParameters, after: &LocalizerParameters) -> Vec<ValueChange> {
     let was = values(before);
     values(after)
         .into_iter()
@@ -84,46 +85,32 @@ pub fn changes(before: &Parameters, after: &Parameters) -> Vec<ValueChange> {
 }
 
 /// A set as flat keys and values.
-pub fn values(parameters: &Parameters) -> BTreeMap<String, Value> {
+pub fn values(parameters: &LocalizerParameters) -> BTreeMap<String, Value> {
     parameters.to_values()
 }
 
-/// `base` with some values replaced. Refused whole, with every fault: a key that means nothing here is one.
+/// `base` with some values replaced. Refused whole, with every fault: an unknown key is one.
 pub fn with_values(
-    base: &Parameters,
+    base: &LocalizerParameters,
     given: impl IntoIterator<Item = (String, Value)>,
-) -> Result<Parameters, Vec<ParameterFault>> {
-    let known = values(base);
-    let mut merged = known.clone();
-    let mut faults = Vec::new();
-    let read = |values: BTreeMap<String, Value>| {
-        serde_json::from_value::<Parameters>(Value::Object(values.into_iter().collect()))
-    };
-    for (key, value) in given {
-        let fault = if known.contains_key(&key) {
-            let mut alone = known.clone();
-            alone.insert(key.clone(), value.clone());
-            read(alone).err().map(|error| format!("{value}: {error}"))
-        } else {
-            Some("there is no such parameter".into())
-        };
-        match fault {
-            Some(fault) => faults.push(ParameterFault { key, fault }),
-            None => drop(merged.insert(key, value)),
+) -> Result<LocalizerParameters, Vec<ParameterFault>> {
+    let given: BTreeMap<String, Value> = given.into_iter().collect();
+    let base = base.of_kind(given.get(KIND_KEY)).map_err(|fault| vec![fault])?;
+    let known = values(&base);
+    let unknown = given.keys().filter(|key| !known.contains_key(*key));
+    let mut faults: Vec<ParameterFault> = unknown
+        .map(|key| ParameterFault {
+            key: key.clone(),
+            fault: "there is no such parameter".into(),
+        })
+        .collect();
+    match base.with_values(given) {
+        Ok((set, _)) if faults.is_empty() => Ok(set),
+        Ok(_) => Err(faults),
+        Err(more) => {
+            faults.extend(more);
+            Err(faults)
         }
-    }
-    let parameters = read(merged).map_err(|error| {
-        vec![ParameterFault {
-            key: "set".into(),
-            fault: error.to_string(),
-        }]
-    })?;
-    // What can be read is checked even where something else cannot: every fault is told at once.
-    faults.extend(parameters.validate().err().into_iter().flatten());
-    if faults.is_empty() {
-        Ok(parameters)
-    } else {
-        Err(faults)
     }
 }
 
@@ -133,7 +120,7 @@ mod tests {
 
     #[test]
     fn shipped_sets_are_found_by_name_and_others_named_in_the_error() {
-        for name in Parameters::NAMES {
+        for name in LocalizerParameters::NAMES {
             assert_eq!(load(name).expect("ships").name, name);
         }
         let message = load("no-such-set").expect_err("does not exist").to_string();

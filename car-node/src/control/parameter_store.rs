@@ -5,11 +5,12 @@
 //! [`ParameterStore::commit`] puts it in force.
 
 use protocol::{ParameterSet, ParamsAction, PendingRevert, SetRef, StoredSet};
-use synpf::{Parameters, Stamp};
+use synpf::Stamp;
 
 use super::answer_cache::CachedAnswer;
 use super::parameter_sets;
 use super::persisted_state::{PersistedState, SavedSet};
+use crate::localization::LocalizerParameters;
 use crate::wire;
 
 /// The set in force.
@@ -18,7 +19,7 @@ pub struct InForce {
     /// Its name.
     pub name: String,
     /// Its values.
-    pub parameters: Parameters,
+    pub parameters: LocalizerParameters,
     /// Who put it in force.
     pub who: String,
     /// When, in wall time.
@@ -30,7 +31,7 @@ pub struct InForce {
 /// A trial that reverts by itself unless it is confirmed.
 #[derive(Debug, Clone, PartialEq)]
 struct PendingTrial {
-    to: (String, Parameters),
+    to: (String, LocalizerParameters),
     at: Stamp,
 }
 
@@ -40,7 +41,7 @@ pub struct PlannedChange {
     /// The set's name.
     pub name: String,
     /// Its values.
-    pub parameters: Parameters,
+    pub parameters: LocalizerParameters,
     /// True when the set is new on the car and must be stored.
     pub store: bool,
     /// Revert after this time unless confirmed [s].
@@ -59,7 +60,7 @@ pub enum Decision {
     /// All sets.
     Sets(Vec<StoredSet>),
     /// Run this shadow set, or none.
-    Shadow(Option<(String, Box<Parameters>)>),
+    Shadow(Option<(String, Box<LocalizerParameters>)>),
 }
 
 /// Why a command about sets is refused.
@@ -84,13 +85,18 @@ const MOST_SETS: usize = 64;
 pub struct ParameterStore {
     persisted: PersistedState,
     in_force: InForce,
-    previous: Option<(String, Parameters)>,
+    previous: Option<(String, LocalizerParameters)>,
     pending: Option<PendingTrial>,
 }
 
 impl ParameterStore {
     /// A store that starts with the set `name` in force.
-    pub fn new(mut persisted: PersistedState, name: String, parameters: Parameters, now: Stamp) -> Self {
+    pub fn new(
+        mut persisted: PersistedState,
+        name: String,
+        parameters: LocalizerParameters,
+        now: Stamp,
+    ) -> Self {
         persisted.revision += 1;
         persisted.settled = Some(name.clone());
         Self {
@@ -155,7 +161,7 @@ impl ParameterStore {
                 to: pending.to.0.clone(),
                 at: pending.at.0,
             }),
-            available: Parameters::NAMES
+            available: LocalizerParameters::NAMES
                 .iter()
                 .map(|name| (*name).to_owned())
                 .chain(self.persisted.sets.keys().cloned())
@@ -211,7 +217,7 @@ impl ParameterStore {
                 })))
             }
             ParamsAction::Delete { name } => {
-                if Parameters::NAMES.contains(&name.as_str()) {
+                if LocalizerParameters::NAMES.contains(&name.as_str()) {
                     return Err(fault(format!("{name} is built in and cannot be deleted")));
                 }
                 if *name == self.in_force.name {
@@ -241,7 +247,7 @@ impl ParameterStore {
 
     fn plan_put(&self, set: &ParameterSet, revert_after_ms: Option<u32>) -> Result<Decision, Refusal> {
         let mut faults = Vec::new();
-        if Parameters::NAMES.contains(&set.name.as_str()) {
+        if LocalizerParameters::NAMES.contains(&set.name.as_str()) {
             faults.push(format!("{} is built in and cannot be overwritten", set.name));
         }
         if self.persisted.sets.len() >= MOST_SETS && !self.persisted.sets.contains_key(&set.name) {
@@ -331,8 +337,8 @@ impl ParameterStore {
         })
     }
 
-    fn find(&self, name: &str) -> Option<Parameters> {
-        Parameters::named(name).or_else(|| Some(self.persisted.sets.get(name)?.parameters.clone()))
+    fn find(&self, name: &str) -> Option<LocalizerParameters> {
+        LocalizerParameters::named(name).or_else(|| Some(self.persisted.sets.get(name)?.parameters.clone()))
     }
 
     fn no_such_set(&self, name: &str) -> String {
@@ -343,9 +349,9 @@ impl ParameterStore {
     }
 
     fn list(&self) -> Vec<StoredSet> {
-        let shipped = Parameters::NAMES.iter().filter_map(|name| {
+        let shipped = LocalizerParameters::NAMES.iter().filter_map(|name| {
             Some(StoredSet {
-                set: parameter_set(name, &Parameters::named(name)?),
+                set: parameter_set(name, &LocalizerParameters::named(name)?),
                 built_in: true,
                 who: None,
             })
@@ -375,7 +381,7 @@ fn trial(milliseconds: Option<u32>) -> Result<Option<f64>, String> {
 }
 
 /// A set as the protocol defines it.
-fn parameter_set(name: &str, parameters: &Parameters) -> ParameterSet {
+fn parameter_set(name: &str, parameters: &LocalizerParameters) -> ParameterSet {
     ParameterSet {
         name: name.into(),
         values: parameter_sets::values(parameters)
@@ -395,7 +401,7 @@ mod tests {
     const NOW: Stamp = Stamp(1_000_000_000);
 
     fn store() -> ParameterStore {
-        let hq = Parameters::named("hq").expect("ships");
+        let hq = LocalizerParameters::named("hq").expect("ships");
         ParameterStore::new(PersistedState::default(), "hq".into(), hq, NOW)
     }
 
@@ -521,7 +527,7 @@ mod tests {
 
         let text = serde_json::to_string(store.persisted()).expect("writes");
         let persisted: PersistedState = serde_json::from_str(&text).expect("reads");
-        let mut again = ParameterStore::new(persisted, "hq".into(), Parameters::default(), NOW);
+        let mut again = ParameterStore::new(persisted, "hq".into(), LocalizerParameters::default(), NOW);
         assert!(again.reference().revision > store.reference().revision);
         change(&mut again, &select("mine", None), NOW);
         assert_eq!(particles_of(&again), 1500);
@@ -619,7 +625,7 @@ mod tests {
     /// force is always a sound set.
     #[test]
     fn no_sequence_of_commands_leads_astray() {
-        let mut keys: Vec<String> = parameter_sets::values(&Parameters::default())
+        let mut keys: Vec<String> = parameter_sets::values(&LocalizerParameters::default())
             .into_keys()
             .collect();
         keys.push("no_such_thing".into());

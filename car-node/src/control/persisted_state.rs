@@ -3,9 +3,9 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use serde::{Deserialize, Serialize};
-use synpf::Parameters;
 
 use super::answer_cache::CachedAnswer;
+use crate::localization::LocalizerParameters;
 
 /// Answers that survive a restart.
 const MOST_ANSWERS: usize = 64;
@@ -15,7 +15,7 @@ const MOST_ANSWERS: usize = 64;
 #[serde(deny_unknown_fields)]
 pub struct SavedSet {
     /// The values.
-    pub parameters: Parameters,
+    pub parameters: LocalizerParameters,
     /// Who put it there.
     pub who: String,
 }

@@ -86,7 +86,7 @@ impl StateFile {
 mod tests {
     use super::*;
     use crate::control::persisted_state::SavedSet;
-    use synpf::Parameters;
+    use crate::localization::LocalizerParameters;
 
     #[test]
     fn what_was_written_is_read_again() {
@@ -101,7 +101,7 @@ mod tests {
         state.sets.insert(
             "mine".into(),
             SavedSet {
-                parameters: Parameters::default(),
+                parameters: LocalizerParameters::default(),
                 who: "anna".into(),
             },
         );

@@ -1,27 +1,39 @@
 //! What each improvement over the reference brings: sets between `synpf-baseline` and ours.
+//!
+//! The reference is a localizer of its own. So the sets lead in two parts: the reference with its defects mended one by one;
+//! then SynPF, first with the reference's noise and number of particles and nothing of what is new in it, then with one
+//! improvement after the other.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use serde_json::Value;
-use synpf::{ParameterFault, Parameters};
+use synpf::{ParameterFault, Parameters, ReferenceParameters};
 
-/// Improvements in the order in which they are made, each with the keys that it changes. What a set changes beyond
-/// these comes last, so that the last row is always the set itself.
-const IMPROVEMENTS: [(&str, &[&str]); 15] = [
+use crate::localization::LocalizerParameters;
+
+/// An improvement, and the keys that it changes.
+type Improvement = (&'static str, &'static [&'static str]);
+
+/// The reference's defects in the order in which they are mended.
+const MENDED: [Improvement; 8] = [
     ("turns keep their sign", &["defect_unsigned_rotation"]),
     ("translation noise has mean zero", &["defect_biased_translation"]),
     ("slow motion counts", &["defect_deadband"]),
     ("lambda_short in metres", &["defect_lambda_short"]),
     (
         "one update per scan, at its own time",
-        &["defect_update_per_odometry", "deskew"],
+        &["defect_update_per_odometry"],
     ),
     ("noise per time, not per message", &["defect_noise_per_message"]),
-    (
-        "ranges unbiased, in 256 directions",
-        &["defect_long_ranges", "theta_discretization"],
-    ),
+    ("ranges unbiased", &["defect_long_ranges"]),
+    ("ranges in 256 directions", &["theta_discretization"]),
+];
+
+/// What is new in SynPF, in the order in which it is added. What a set changes beyond these comes last, so that the last
+/// row is always the set itself.
+const IMPROVEMENTS: [Improvement; 9] = [
+    ("beams brought to the scan's time", &["deskew"]),
     (
         "motion noise tuned",
         &[
@@ -66,10 +78,12 @@ const IMPROVEMENTS: [(&str, &[&str]); 15] = [
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Change {
-    /// The reference as it is, or the set as it is.
+    /// The reference as it is.
     None,
     /// The improvement on top of all those before.
     Added,
+    /// SynPF in place of the mended reference.
+    Replaced,
     /// The set with this improvement taken back.
     LeftOut,
 }
@@ -84,49 +98,40 @@ pub struct Step {
     /// The keys that change, with the value that they get.
     pub values: BTreeMap<String, Value>,
     /// The set.
-    pub parameters: Parameters,
+    pub parameters: LocalizerParameters,
 }
 
 /// The sets from `synpf-baseline` to `target`, one improvement after the other, and then `target` without each.
 /// Improvements that `target` does not make are left out. Fails where a set in between contradicts itself.
-pub fn steps(target: &Parameters) -> Result<Vec<Step>, Vec<ParameterFault>> {
-    let baseline = Parameters::named("synpf-baseline").unwrap_or_default();
-    let (from, to) = (baseline.to_values(), target.to_values());
-    let changed = |key: &str| from.get(key) != to.get(key);
-    let mut groups: Vec<(&str, Vec<&str>)> = IMPROVEMENTS
-        .iter()
-        .map(|(name, keys)| (*name, keys.iter().copied().filter(|key| changed(key)).collect()))
-        .collect();
-    let named = |key: &str| IMPROVEMENTS.iter().any(|(_, keys)| keys.contains(&key));
-    let rest = to
-        .keys()
-        .map(String::as_str)
-        .filter(|key| changed(key) && !named(key));
-    groups.push(("all else that the set changes", rest.collect()));
-    groups.retain(|(_, keys)| !keys.is_empty());
-
-    let some = |keys: &[&str], of: &BTreeMap<String, Value>| -> BTreeMap<String, Value> {
-        keys.iter()
-            .map(|key| ((*key).to_owned(), of[*key].clone()))
-            .collect()
-    };
+pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFault>> {
+    let shipped = LocalizerParameters::from(ReferenceParameters::default());
     let mut steps = vec![Step {
         name: "synpf-baseline".into(),
         change: Change::None,
         values: BTreeMap::new(),
-        parameters: baseline,
+        parameters: shipped.clone(),
     }];
-    for (name, keys) in &groups {
-        let values = some(keys, &to);
-        let before = steps.last().map_or(target, |step| &step.parameters);
-        let (parameters, _) = before.with_values(values.clone())?;
-        steps.push(Step {
-            name: (*name).into(),
-            change: Change::Added,
-            values,
-            parameters,
-        });
-    }
+    let (plain, groups) = match target {
+        LocalizerParameters::Reference(_) => {
+            let groups = groups(&shipped, target, &MENDED);
+            (shipped, groups)
+        }
+        LocalizerParameters::SynPf(_) => {
+            let mended = LocalizerParameters::from(mended());
+            add(&mut steps, &groups(&shipped, &mended, &MENDED), &mended)?;
+            let plain = LocalizerParameters::from(plain());
+            steps.push(Step {
+                name: "in SynPF, without anything new".into(),
+                change: Change::Replaced,
+                values: BTreeMap::new(),
+                parameters: plain.clone(),
+            });
+            let groups = groups(&plain, target, &IMPROVEMENTS);
+            (plain, groups)
+        }
+    };
+    add(&mut steps, &groups, target)?;
+    let from = plain.to_values();
     for (name, keys) in &groups {
         let values = some(keys, &from);
         let (parameters, _) = target.with_values(values.clone())?;
@@ -140,24 +145,122 @@ pub fn steps(target: &Parameters) -> Result<Vec<Step>, Vec<ParameterFault>> {
     Ok(steps)
 }
 
+/// The reference without the defects that matter under its shipped parameters.
+fn mended() -> ReferenceParameters {
+    let mut set = ReferenceParameters {
+        theta_discretization: 256,
+        ..ReferenceParameters::default()
+    };
+    set.defects.defect_unsigned_rotation = false;
+    set.defects.defect_biased_translation = false;
+    set.defects.defect_deadband = false;
+    set.defects.defect_lambda_short = false;
+    set.defects.defect_update_per_odometry = false;
+    set.defects.defect_noise_per_message = false;
+    set.defects.defect_long_ranges = false;
+    set
+}
+
+/// SynPF as near to the mended reference as it comes: its noise, its number of particles, resampled in every update, and
+/// neither fit nor recovery.
+fn plain() -> Parameters {
+    let reference = ReferenceParameters::default();
+    let mut set = Parameters::default();
+    set.particles.max_particles = reference.max_particles;
+    set.particles.min_particles = reference.max_particles;
+    set.particles.resample_ess_ratio = 1.0;
+    set.beams.deskew = false;
+    set.motion.alpha_1_tum = reference.alpha_1_tum;
+    set.motion.alpha_2_tum = reference.alpha_2_tum;
+    set.motion.alpha_3_tum = reference.alpha_3_tum;
+    set.motion.alpha_4_tum = reference.alpha_4_tum;
+    set.motion.diffusion_xy = 0.0;
+    set.motion.diffusion_heading = 0.0;
+    set.motion.learn_slip = false;
+    set.refinement.refine = false;
+    set.refinement.wall_offset_distance = 0.0;
+    set.recovery.injection = false;
+    set.recovery.recover = false;
+    set
+}
+
+/// The improvements that lead from one set to another, with the keys that change; last, all keys that none of them names.
+fn groups(
+    from: &LocalizerParameters,
+    to: &LocalizerParameters,
+    improvements: &[Improvement],
+) -> Vec<(&'static str, Vec<String>)> {
+    let (from, to) = (from.to_values(), to.to_values());
+    let changed = |key: &str| from.get(key) != to.get(key);
+    let named = |key: &str| improvements.iter().any(|(_, keys)| keys.contains(&key));
+    let mut groups: Vec<(&str, Vec<String>)> = improvements
+        .iter()
+        .map(|(name, keys)| {
+            let keys = keys.iter().filter(|key| changed(key));
+            (*name, keys.map(|key| (*key).to_owned()).collect())
+        })
+        .collect();
+    let rest = to.keys().filter(|key| changed(key) && !named(key)).cloned();
+    groups.push(("all else that the set changes", rest.collect()));
+    groups.retain(|(_, keys)| !keys.is_empty());
+    groups
+}
+
+/// Adds one improvement after the other, on top of the last step.
+fn add(
+    steps: &mut Vec<Step>,
+    groups: &[(&str, Vec<String>)],
+    to: &LocalizerParameters,
+) -> Result<(), Vec<ParameterFault>> {
+    let to_values = to.to_values();
+    for (name, keys) in groups {
+        let values = some(keys, &to_values);
+        let before = steps.last().map_or(to, |step| &step.parameters);
+        let (parameters, _) = before.with_values(values.clone())?;
+        steps.push(Step {
+            name: (*name).into(),
+            change: Change::Added,
+            values,
+            parameters,
+        });
+    }
+    Ok(())
+}
+
+fn some(keys: &[String], of: &BTreeMap<String, Value>) -> BTreeMap<String, Value> {
+    keys.iter()
+        .filter_map(|key| Some((key.clone(), of.get(key)?.clone())))
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn named(name: &str) -> LocalizerParameters {
+        LocalizerParameters::named(name).expect("ships")
+    }
+
+    fn rows(steps: &[Step], change: Change) -> Vec<&Step> {
+        steps.iter().filter(|step| step.change == change).collect()
+    }
+
     #[test]
-    fn the_steps_lead_from_the_baseline_to_each_set() {
+    fn the_steps_lead_from_the_reference_over_to_each_set() {
         for name in ["hq", "lq", "adaptive"] {
-            let target = Parameters::named(name).expect("ships");
+            let target = named(name);
             let steps = steps(&target).expect("sound");
-            let added: Vec<&Step> = steps.iter().filter(|step| step.change == Change::Added).collect();
-            assert_eq!(
-                Some(&steps[0].parameters),
-                Parameters::named("synpf-baseline").as_ref()
-            );
+            assert_eq!(steps[0].parameters, named("synpf-baseline"));
+            let replaced = steps.iter().position(|step| step.change == Change::Replaced);
+            let (reference, synpf) = steps.split_at(replaced.expect("one"));
+            assert!(reference.iter().all(|step| step.parameters.kind() == "reference"));
+            assert!(synpf.iter().all(|step| step.parameters.kind() == "synpf"));
+            assert_eq!(reference.len(), 1 + MENDED.len());
+            let added = rows(synpf, Change::Added);
             assert_eq!(added.last().map(|step| &step.parameters), Some(&target), "{name}");
-            let left_out = steps.iter().filter(|step| step.change == Change::LeftOut);
-            assert_eq!(left_out.clone().count(), added.len());
-            assert!(left_out.into_iter().all(|step| step.parameters != target));
+            let left_out = rows(&steps, Change::LeftOut);
+            assert_eq!(left_out.len(), added.len());
+            assert!(left_out.iter().all(|step| step.parameters != target));
             // Every step changes something.
             assert!(
                 steps
@@ -168,17 +271,36 @@ mod tests {
     }
 
     #[test]
+    fn a_set_of_the_reference_is_reached_without_synpf() {
+        let values = [("defect_deadband", Value::from(false)), ("z_hit", 0.8.into())];
+        let values = values.map(|(key, value)| (key.to_owned(), value));
+        let (target, _) = named("synpf-baseline").with_values(values).expect("sound");
+        let steps = steps(&target).expect("sound");
+        let names: Vec<&str> = steps.iter().map(|step| step.name.as_str()).collect();
+        let changes = ["slow motion counts", "all else that the set changes"];
+        assert_eq!(
+            names,
+            [["synpf-baseline"].as_slice(), &changes, &changes].concat()
+        );
+        assert_eq!(steps[2].parameters, target);
+    }
+
+    #[test]
     fn every_key_that_is_named_exists() {
-        let known = Parameters::default().to_values();
-        for key in IMPROVEMENTS.iter().flat_map(|(_, keys)| *keys) {
-            assert!(known.contains_key(*key), "{key}");
+        for (set, improvements) in [
+            ("synpf-baseline", MENDED.as_slice()),
+            ("hq", IMPROVEMENTS.as_slice()),
+        ] {
+            let known = named(set).to_values();
+            for key in improvements.iter().flat_map(|(_, keys)| *keys) {
+                assert!(known.contains_key(*key), "{key}");
+            }
         }
     }
 
     #[test]
     fn what_no_improvement_names_comes_last() {
-        let hq = Parameters::default();
-        let (target, _) = hq
+        let (target, _) = named("hq")
             .with_values([("z_hit".to_owned(), Value::from(0.8))])
             .expect("sound");
         let steps = steps(&target).expect("sound");

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use maps::Pose;
 use serde::Serialize;
-use synpf::{Dropped, PoseError, Stamp, SynPf, Update};
+use synpf::{Dropped, Localizer, PoseError, Stamp, Update};
 
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
@@ -106,7 +106,7 @@ pub enum EvaluateError {
 
 /// Runs `localizer` over `arrivals`. `observe` sees every update and the share of the log done so far.
 pub fn run(
-    localizer: &mut SynPf,
+    localizer: &mut dyn Localizer,
     arrivals: &[Arrival],
     truth: &Truth,
     start: Start,
@@ -185,7 +185,12 @@ pub fn run(
 }
 
 /// Gives the localizer its start; `now` is the latest odometry's stamp.
-fn begin(localizer: &mut SynPf, truth: &Truth, start: Start, now: Stamp) -> Result<(), EvaluateError> {
+fn begin(
+    localizer: &mut dyn Localizer,
+    truth: &Truth,
+    start: Start,
+    now: Stamp,
+) -> Result<(), EvaluateError> {
     match start {
         Start::Pose(pose) => localizer.initialize(pose)?,
         Start::Truth => localizer.initialize(truth.at(now).ok_or(EvaluateError::NoTruth)?)?,

@@ -3,7 +3,16 @@
 use crossbeam_channel::Sender;
 use maps::Pose;
 use protocol::SetRef;
-use synpf::{Hypothesis, Tuning};
+use synpf::{Hypothesis, Localizer, PreparedParameters};
+
+/// How a parameter set is put in force. Everything that takes time was done before, in another thread.
+#[derive(Debug)]
+pub enum LocalizerChange {
+    /// The localizer takes the set and keeps its state.
+    Tune(PreparedParameters),
+    /// A localizer of another kind, under its set and without a pose, goes on from where the one before was.
+    Replace(Box<dyn Localizer>),
+}
 
 /// A command that the filter executes between two updates. A reply's number is the first update under the change.
 #[derive(Debug)]
@@ -12,10 +21,10 @@ pub enum FilterCommand {
     SetParameters {
         /// The set's name and revision, for proposals, laps and the shadow.
         set: SetRef,
-        /// The set with its tables.
-        tuning: Box<Tuning>,
+        /// How the localizer changes.
+        change: LocalizerChange,
         /// Receives the update.
-        reply: Sender<u64>,
+        reply: Sender<Result<u64, String>>,
     },
     /// Start again from a pose.
     Initialize {

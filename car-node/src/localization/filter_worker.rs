@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
 use protocol::{EventKind, Rates, SetRef};
-use synpf::{Dropped, Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, SynPf, TrackMap, Update};
+use synpf::{Dropped, Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, TrackMap, Update};
 
-use super::filter_command::FilterCommand;
+use super::filter_command::{FilterCommand, LocalizerChange};
 use super::lap_counter::LapCounter;
 use super::pace::Pace;
 use super::shadow_channel::{ShadowInput, ShadowScan, ShadowSender};
@@ -27,7 +27,7 @@ use crate::wire;
 #[derive(Debug)]
 pub struct FilterConfig {
     /// The localizer.
-    pub localizer: SynPf,
+    pub localizer: Box<dyn Localizer>,
     /// The map that it localizes on.
     pub map: Arc<TrackMap>,
     /// Judges every update.
@@ -153,10 +153,12 @@ impl FilterWorker {
         let next = self.update_number() + 1;
         let now = self.now();
         match command {
-            FilterCommand::SetParameters { set, tuning, reply } => {
-                self.config.localizer.tune(*tuning);
-                self.config.set = set;
-                reply.send(next).ok();
+            FilterCommand::SetParameters { set, change, reply } => {
+                let changed = self.change_localizer(change);
+                if changed.is_ok() {
+                    self.config.set = set;
+                }
+                reply.send(changed.map(|()| next)).ok();
             }
             FilterCommand::Initialize { pose, reply } => {
                 reply.send(self.initialize(pose).map(|()| next)).ok();
@@ -181,6 +183,20 @@ impl FilterWorker {
                 self.config.monitor.on_search(now);
                 self.laps.on_new_pose();
                 reply.send(next).ok();
+            }
+        }
+    }
+
+    fn change_localizer(&mut self, change: LocalizerChange) -> Result<(), String> {
+        let localizer = &mut self.config.localizer;
+        match change {
+            LocalizerChange::Tune(prepared) => localizer
+                .set_parameters(prepared)
+                .map_err(|_| "the set is for another kind of localizer".to_owned()),
+            LocalizerChange::Replace(mut successor) => {
+                successor.take_over(localizer.hand_over());
+                *localizer = successor;
+                Ok(())
             }
         }
     }
@@ -321,8 +337,7 @@ impl FilterWorker {
         self.watch_slip(&update);
         if self.paces.cloud.due(update.stamp, rates.cloud) {
             // Every n-th particle; their order has no meaning, so this is a fair sample.
-            let step = update.particles.div_ceil(protocol::Cloud::MAX_PARTICLES).max(1);
-            let particles = self.config.localizer.particles().step_by(step).collect();
+            let particles = self.config.localizer.particles(protocol::Cloud::MAX_PARTICLES);
             shared.telemetry.cloud(views::cloud(&update, particles));
         }
         if self.paces.scan.due(update.stamp, rates.scan) {

@@ -3,7 +3,10 @@
 pub mod filter_command;
 pub mod filter_worker;
 pub mod lap_counter;
+mod localizer_parameters;
 mod pace;
 pub mod shadow;
 pub mod shadow_channel;
 mod views;
+
+pub use localizer_parameters::{KIND_KEY, LocalizerParameters};

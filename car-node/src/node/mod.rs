@@ -16,7 +16,7 @@ use std::time::Duration;
 use crossbeam_channel::{Sender, bounded};
 use maps::{Pose, Raceline};
 use protocol::{CarInfo, CarName, EventKind, Rates, Stamps, encode};
-use synpf::{PoseError, SetUpError, SynPf, TrackMap};
+use synpf::{Localizer, PoseError, SetUpError, TrackMap};
 use zenoh::Session;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
@@ -203,19 +203,14 @@ impl Node {
             .map_or(Ok(PersistedState::default()), StateFile::read)?;
         let set = first_set(set, &persisted)?;
         let mount = source.mount();
-        let mut localizer = SynPf::new(
-            Arc::clone(&map.map),
-            mount.base_link_from_laser,
-            set.parameters.clone(),
-            seed,
-        )?;
+        let mut localizer = set.parameters.build(&map.map, mount.base_link_from_laser, seed)?;
         let known = match begin {
             Begin::Pose(pose) => Some(pose),
             Begin::Source => source.start(),
             Begin::Global => None,
         };
-        map.map.prepare(known, &set.parameters);
-        let begins_with_a_pose = begin_at(&mut localizer, begin, source.start())?;
+        set.parameters.prepare_tables(&map.map, known);
+        let begins_with_a_pose = begin_at(localizer.as_mut(), begin, source.start())?;
 
         let session = network::open(&connect)?;
         let started = wall_now();
@@ -437,7 +432,7 @@ fn first_set(wanted: Option<NamedSet>, persisted: &PersistedState) -> Result<Nam
 }
 
 /// Gives the localizer its start. True when that is a pose.
-fn begin_at(localizer: &mut SynPf, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
+fn begin_at(localizer: &mut dyn Localizer, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
     match begin {
         Begin::Pose(pose) => localizer.initialize(pose)?,
         Begin::Source => localizer.initialize(start.ok_or(NodeError::NoStart)?)?,

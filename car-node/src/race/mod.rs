@@ -15,13 +15,14 @@ use maps::{Pose, wrap_angle};
 use serde::{Deserialize, Serialize};
 use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
 
-use synpf::{Localizer, Odometry, Parameters, Scan, SetUpError, Stamp, SynPf, TrackMap, Twist, YawRate};
+use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use metrics::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary};
 pub use paper::{PAPER_ROWS, PaperRow};
 
 use crate::health::{Monitor, Thresholds};
+use crate::localization::LocalizerParameters;
 use crate::sensors::{Script, ScriptedIncident};
 use metrics::Recorder;
 
@@ -29,7 +30,7 @@ use metrics::Recorder;
 #[derive(Debug, Clone, PartialEq)]
 pub enum PoseSource {
     /// The filter with a parameter set.
-    SynPf(Box<Parameters>),
+    Localizer(LocalizerParameters),
     /// Wheel odometry alone, from a perfect start.
     Odometry,
     /// The truth, as an upper bound.
@@ -178,7 +179,7 @@ struct CarRunner {
 }
 
 enum ActivePoseSource {
-    SynPf(Box<SynPf>, Box<Monitor>),
+    Localizer(Box<dyn Localizer>, Box<Monitor>),
     /// `map_from_odom`, once it is known.
     Odometry(Option<Pose>, Pose),
     Truth,
@@ -197,16 +198,15 @@ impl CarRunner {
         let base_link_from_laser = car.lidar.base_link_from_laser;
         let pose_source = match pose_source {
             _ if car.guidance == Guidance::Truth => ActivePoseSource::Truth,
-            PoseSource::SynPf(parameters) => {
+            PoseSource::Localizer(parameters) => {
                 let seed = seed.wrapping_add(index as u64);
-                let parameters = Parameters::clone(parameters);
                 // A car's tables are ready before it starts.
-                map.prepare(Some(start), &parameters);
-                let mut localizer = SynPf::new(Arc::clone(map), base_link_from_laser, parameters, seed)?;
+                parameters.prepare_tables(map, Some(start));
+                let mut localizer = parameters.build(map, base_link_from_laser, seed)?;
                 localizer.initialize(start)?;
                 let mut monitor = Monitor::new(Thresholds::default(), stamp(world.now()));
                 monitor.on_new_pose(stamp(world.now()));
-                ActivePoseSource::SynPf(Box::new(localizer), Box::new(monitor))
+                ActivePoseSource::Localizer(localizer, Box::new(monitor))
             }
             PoseSource::Odometry => ActivePoseSource::Odometry(None, start),
             PoseSource::Truth => ActivePoseSource::Truth,
@@ -236,7 +236,7 @@ impl CarRunner {
                 })
             }
             Message::Gyro(gyro) => {
-                if let ActivePoseSource::SynPf(localizer, _) = &mut self.pose_source {
+                if let ActivePoseSource::Localizer(localizer, _) = &mut self.pose_source {
                     let reading = YawRate {
                         stamp: stamp(gyro.stamp),
                         rate: gyro.yaw_rate,
@@ -265,7 +265,7 @@ impl CarRunner {
             Message::Placed(pose) => {
                 // The localizer gets the pose at which the recovery crew put the car.
                 match &mut self.pose_source {
-                    ActivePoseSource::SynPf(localizer, monitor) => {
+                    ActivePoseSource::Localizer(localizer, monitor) => {
                         localizer.initialize(*pose).ok();
                         monitor.on_new_pose(stamp(world.now()));
                     }
@@ -309,7 +309,7 @@ impl CarRunner {
     /// `map_from_base_link` at the odometry's stamp.
     fn on_odometry(&mut self, odometry: &simulator::Odometry, world: &World, index: usize) -> Option<Pose> {
         match &mut self.pose_source {
-            ActivePoseSource::SynPf(localizer, monitor) => {
+            ActivePoseSource::Localizer(localizer, monitor) => {
                 monitor.on_odometry(stamp(world.now()));
                 let message = Odometry {
                     stamp: stamp(odometry.stamp),
@@ -345,7 +345,7 @@ impl CarRunner {
             ranges: scan.ranges.clone(),
         };
         let truth = self.truth_at(message.stamp);
-        let ActivePoseSource::SynPf(localizer, monitor) = &mut self.pose_source else {
+        let ActivePoseSource::Localizer(localizer, monitor) = &mut self.pose_source else {
             // What has no opinion of scans is judged by where it says the car is, or the truth.
             let pose = match &self.pose_source {
                 ActivePoseSource::Odometry(map_from_odom, _) => {
@@ -445,8 +445,8 @@ mod tests {
     #[test]
     fn a_race_tells_its_states_and_what_went_wrong_with_its_cause() {
         let (track, map) = club();
-        let parameters = Box::new(Parameters::named("hq").expect("ships"));
-        let setup = setup(PoseSource::SynPf(parameters), 1, 1);
+        let parameters = LocalizerParameters::named("hq").expect("ships");
+        let setup = setup(PoseSource::Localizer(parameters), 1, 1);
         let knock = ScriptedIncident {
             at: Duration::from_secs(6),
             car: 0,
@@ -493,7 +493,7 @@ mod tests {
         let setup = RaceSetup {
             quality: Quality::Lq,
             ..setup(
-                PoseSource::SynPf(Box::new(Parameters::named("hq").expect("ships"))),
+                PoseSource::Localizer(LocalizerParameters::named("hq").expect("ships")),
                 3,
                 1,
             )
@@ -526,11 +526,11 @@ mod tests {
     #[test]
     fn the_same_seed_is_the_same_race() {
         let (track, map) = club();
-        let parameters = Parameters::named("hq").expect("ships");
+        let parameters = LocalizerParameters::named("hq").expect("ships");
         let run = |seed| {
             let setup = RaceSetup {
                 seed,
-                ..setup(PoseSource::SynPf(Box::new(parameters.clone())), 1, 2)
+                ..setup(PoseSource::Localizer(parameters.clone()), 1, 2)
             };
             let results = race(&track, &map, &setup).expect("a race");
             let without_load: Vec<_> = results

@@ -12,6 +12,7 @@ use car_node::control::parameter_store::ParameterStore;
 use car_node::control::persisted_state::PersistedState;
 use car_node::control::{CachedAnswer, CommandHandler, CommandHandlerConfig, PayloadHash};
 use car_node::health::{Monitor, Thresholds};
+use car_node::localization::LocalizerParameters;
 use car_node::localization::filter_command::FilterCommand;
 use car_node::localization::filter_worker::{self, FilterConfig};
 use car_node::localization::shadow;
@@ -27,7 +28,7 @@ use protocol::{
     Action, Answer, Command, CommandId, Event, EventKind, Header, LinkReport, Message, Outcome, ParameterSet,
     Params, ParamsAction, Pose2, Rates, RatesAction, RelocalizeAction, Stamps, Topic, Value, decode, encode,
 };
-use synpf::{Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist};
+use synpf::{Odometry, Scan, Stamp, TrackMap, Twist};
 
 /// What can happen to a car. Numbers come with all their bits: NaN, infinities, subnormals.
 #[derive(Debug, Arbitrary)]
@@ -272,10 +273,10 @@ impl Car {
         let name = memory.settled.clone().unwrap_or_else(|| "hq".into());
         let parameters = match memory.sets.get(&name) {
             Some(stored) => stored.parameters.clone(),
-            None => Parameters::named(&name).expect("ships, or was stored"),
+            None => LocalizerParameters::named(&name).expect("ships, or was stored"),
         };
         let mount = Pose::new(0.27, 0.0, 0.0);
-        let mut localizer = SynPf::new(Arc::clone(map()), mount, parameters.clone(), 1).expect("a sound set");
+        let mut localizer = parameters.build(map(), mount, 1).expect("a sound set");
         localizer
             .initialize(map().grid().origin * Pose::new(1.0, 1.0, 0.0))
             .expect("on the map");
@@ -563,7 +564,9 @@ fn bytes_of<M: Message>(message: &M) -> Vec<u8> {
 impl From<Name> for String {
     fn from(name: Name) -> Self {
         match name {
-            Name::Shipped(pick) => Parameters::NAMES[usize::from(pick) % Parameters::NAMES.len()].into(),
+            Name::Shipped(pick) => {
+                LocalizerParameters::NAMES[usize::from(pick) % LocalizerParameters::NAMES.len()].into()
+            }
             Name::Mine => "mine".into(),
             Name::Wet => "wet".into(),
             Name::Other(name) => name,
@@ -599,7 +602,7 @@ impl From<Any> for Action {
     fn from(any: Any) -> Self {
         let known = |pick: u16| {
             static KEYS: OnceLock<Vec<String>> = OnceLock::new();
-            let keys = KEYS.get_or_init(|| Parameters::default().to_values().into_keys().collect());
+            let keys = KEYS.get_or_init(|| LocalizerParameters::default().to_values().into_keys().collect());
             keys[usize::from(pick) % keys.len()].clone()
         };
         let put = |name: Name, values, revert_after_ms| {

@@ -1,16 +1,16 @@
 //! Commands about parameter sets: switching, trials, the shadow set, and the switches that the car makes by itself.
 
-use std::sync::{Arc, PoisonError};
+use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::bounded;
 use protocol::{Command, CommandId, EventKind, Outcome, ParamsAction, Reply};
-use synpf::{Parameters, SynPf, Tuning};
 
 use super::{CommandHandler, done, refused};
 use crate::control::parameter_sets;
 use crate::control::parameter_store::{Decision, PlannedChange, Refusal};
-use crate::localization::filter_command::FilterCommand;
+use crate::localization::LocalizerParameters;
+use crate::localization::filter_command::{FilterCommand, LocalizerChange};
 use crate::localization::shadow::ShadowCommand;
 use crate::sensors::clock::wall_now;
 use crate::telemetry::queue::Record;
@@ -23,8 +23,8 @@ const AUTO_HOLD: Duration = Duration::from_secs(10);
 const AUTO: &str = "auto";
 /// The operator's name when a trial is reverted because nobody confirmed it.
 const FALL_BACK: &str = "fall-back";
-/// Seed of the shadow's localizer: the same in every run.
-const SHADOW_SEED: u64 = 1;
+/// Seed of the localizers that are made here: the same in every run.
+const SEED: u64 = 1;
 
 impl CommandHandler {
     pub(super) fn apply_params(&mut self, command: &Command, action: &ParamsAction) -> Outcome {
@@ -110,24 +110,34 @@ impl CommandHandler {
         Ok(update)
     }
 
-    /// Has the filter swap its set. The set's tables are built here, not in the filter's thread.
+    /// Has the filter swap its set, and its localizer if the set is for another kind. Tables and localizers are made here,
+    /// not in the filter's thread.
     fn swap(&self, change: &PlannedChange) -> Result<u64, Vec<String>> {
-        let map = &self.config.track_map;
-        map.prepare(self.current_pose(), &change.parameters);
-        let tuning = Tuning::new(change.parameters.clone(), map)
+        let (map, set) = (&self.config.track_map, &change.parameters);
+        let prepared = set
+            .prepare(map, self.current_pose())
             .map_err(|faults| faults.iter().map(ToString::to_string).collect::<Vec<_>>())?;
+        let localizer_change = if set.kind() == self.config.store.in_force().parameters.kind() {
+            LocalizerChange::Tune(prepared)
+        } else {
+            let localizer = set
+                .build(map, self.config.base_link_from_laser, SEED)
+                .map_err(|fault| vec![fault.to_string()])?;
+            LocalizerChange::Replace(localizer)
+        };
         let (reply, replied) = bounded(1);
         let command = FilterCommand::SetParameters {
             set: self.config.store.next_reference(&change.name),
-            tuning: Box::new(tuning),
+            change: localizer_change,
             reply,
         };
         self.send_to_filter(command, &replied)
+            .and_then(|changed| changed)
             .map_err(|fault| vec![fault])
     }
 
     /// Runs a shadow set, or ends it. The set's tables are built here, not in the shadow's thread.
-    fn run_shadow(&mut self, command: &Command, set: Option<(String, Box<Parameters>)>) -> Outcome {
+    fn run_shadow(&mut self, command: &Command, set: Option<(String, Box<LocalizerParameters>)>) -> Outcome {
         let who = command.operator.clone();
         let Some((name, parameters)) = set else {
             return if self.end_shadow(&who, Some(command.id)) {
@@ -136,15 +146,10 @@ impl CommandHandler {
                 refused("no shadow set is running".into())
             };
         };
-        self.config.track_map.prepare(self.current_pose(), &parameters);
-        let localizer = SynPf::new(
-            Arc::clone(&self.config.track_map),
-            self.config.base_link_from_laser,
-            *parameters,
-            SHADOW_SEED,
-        );
-        let localizer = match localizer {
-            Ok(localizer) => Box::new(localizer),
+        let map = &self.config.track_map;
+        parameters.prepare_tables(map, self.current_pose());
+        let localizer = match parameters.build(map, self.config.base_link_from_laser, SEED) {
+            Ok(localizer) => localizer,
             Err(fault) => return refused(fault.to_string()),
         };
         let run = ShadowCommand::Run {

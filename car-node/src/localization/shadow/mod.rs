@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, select};
 use protocol::EventKind;
-use synpf::{Mode, Stamp, SynPf};
+use synpf::{Localizer, Mode, Stamp};
 
 use self::budget::{Budget, ScanCost};
 use self::comparison::{ScanOutcome, Window};
@@ -38,7 +38,7 @@ pub enum ShadowCommand {
         /// The operator.
         who: String,
         /// A localizer under the set, without a pose.
-        localizer: Box<SynPf>,
+        localizer: Box<dyn Localizer>,
     },
     /// Run no set.
     End {
@@ -76,7 +76,7 @@ pub fn start(
 /// A shadow set that runs.
 struct RunningShadow {
     name: String,
-    localizer: Box<SynPf>,
+    localizer: Box<dyn Localizer>,
     /// When it got its pose; None while it has none.
     initialized: Option<Stamp>,
     window: Window,

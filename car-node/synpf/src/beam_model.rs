@@ -5,7 +5,6 @@ use wide::f32x8;
 
 use crate::beam_layout::MOST_BEAMS;
 use crate::cddt::DIRECTIONS;
-use crate::defects::Defects;
 use crate::particles::Particles;
 use crate::pose_array::{PoseArray, load};
 use crate::preprocessed_scan::Beam;
@@ -36,17 +35,12 @@ pub(crate) struct BeamModel {
 }
 
 impl BeamModel {
-    /// Computes the table. `resolution` is the map's cell size [m].
-    pub(crate) fn new(parameters: &SensorParameters, resolution: f64, defects: Defects) -> Self {
+    /// Computes the table.
+    pub(crate) fn new(parameters: &SensorParameters) -> Self {
         let steps = (parameters.max_range / STEP).round() as usize + 1;
         let [z_hit, z_short, z_max, z_rand] = parameters.mixture();
         let sigma_hit = parameters.sigma_hit;
-        let lambda = if defects.defect_lambda_short {
-            // Per cell, but divided by the cell's size where multiplying was meant; back in metres.
-            parameters.lambda_short / resolution / resolution
-        } else {
-            parameters.lambda_short
-        };
+        let lambda = parameters.lambda_short;
         let squash = 1.0 / parameters.squash_factor;
         // Probabilities per step, so that the four modes can be added up.
         let gauss: Vec<f64> = (0..steps)
@@ -292,7 +286,7 @@ mod tests {
             squash_factor: 1.0,
             ..SensorParameters::default()
         };
-        BeamModel::new(&parameters, 0.05, Defects::default())
+        BeamModel::new(&parameters)
     }
 
     #[test]
@@ -312,20 +306,5 @@ mod tests {
         let at = |measured: f32| model.row(measured)[model.step_of(100.0, 0.05)];
         assert!(at(5.0) > at(3.0) && at(3.0) > at(7.0));
         assert!(at(f32::INFINITY) > at(7.0), "no return has a share of its own");
-    }
-
-    #[test]
-    fn dividing_lambda_puts_short_readings_at_zero() {
-        let parameters = SensorParameters {
-            squash_factor: 1.0,
-            ..SensorParameters::default()
-        };
-        let defects = Defects {
-            defect_lambda_short: true,
-            ..Defects::default()
-        };
-        let model = BeamModel::new(&parameters, 0.05, defects);
-        let at = |measured: f32| model.row(measured)[model.step_of(100.0, 0.05)];
-        assert!(at(0.0) > at(1.0) + 3.0);
     }
 }

@@ -7,7 +7,6 @@ mod beam_layout;
 mod beam_model;
 mod calibration;
 mod cddt;
-mod defects;
 mod error;
 mod estimate;
 mod likelihood_field;
@@ -43,7 +42,6 @@ mod tuning;
 mod validation;
 
 pub use beam_layout::{BeamLayout, BeamParameters};
-pub use defects::Defects;
 pub use error::SetUpError;
 pub use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,

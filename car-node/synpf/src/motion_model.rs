@@ -7,7 +7,6 @@
 use maps::Pose;
 use serde::{Deserialize, Serialize};
 
-use crate::defects::Defects;
 use crate::validation::Check;
 
 /// Which motion model moves the particles.
@@ -197,19 +196,9 @@ pub(crate) enum Motion {
 
 impl Motion {
     /// The motion `delta` of `base_link` over `dt` [s]. `widen` scales the noise of the model; 1 leaves it as tuned.
-    pub(crate) fn new(
-        delta: Pose,
-        dt: f64,
-        widen: f64,
-        parameters: &MotionParameters,
-        defects: Defects,
-    ) -> Self {
+    pub(crate) fn new(delta: Pose, dt: f64, widen: f64, parameters: &MotionParameters) -> Self {
         // Each interval has its share of the motion, and the variances of the intervals add up.
-        let intervals = if defects.defect_noise_per_message {
-            1.0
-        } else {
-            (dt / parameters.noise_interval).max(1e-3)
-        };
+        let intervals = (dt / parameters.noise_interval).max(1e-3);
         let grow = intervals.sqrt() * widen;
         let per = |value: f64| value.abs() / intervals;
         let floor_xy = parameters.diffusion_xy * dt.max(0.0).sqrt();
@@ -235,15 +224,8 @@ impl Motion {
                         (p.alpha_3_amcl * step + p.alpha_4_amcl * (turn1 + turn2)).sqrt(),
                     )
                 };
-                let mut mean = [rot1, trans, rot2];
-                if defects.defect_unsigned_rotation {
-                    mean = [rot1.abs(), trans, rot2.abs()];
-                }
-                if defects.defect_biased_translation {
-                    mean[1] += 0.5 * sigma_trans * grow * trans.signum();
-                }
                 Self::Polar {
-                    mean: mean.map(|v| v as f32),
+                    mean: [rot1, trans, rot2].map(|v| v as f32),
                     sigma: [
                         with_floor(sigma1, floor_heading),
                         with_floor(sigma_trans, floor_xy),
@@ -316,7 +298,7 @@ mod tests {
             motion_model: model,
             ..MotionParameters::default()
         };
-        Motion::new(delta, dt, 1.0, &parameters, Defects::default())
+        Motion::new(delta, dt, 1.0, &parameters)
     }
 
     /// Where a particle at the origin goes without noise.
@@ -378,13 +360,8 @@ mod tests {
             diffusion_heading: 0.0,
             ..MotionParameters::default()
         };
-        let Motion::Polar { sigma, .. } = Motion::new(
-            delta,
-            parameters.noise_interval,
-            1.0,
-            &parameters,
-            Defects::default(),
-        ) else {
+        let Motion::Polar { sigma, .. } = Motion::new(delta, parameters.noise_interval, 1.0, &parameters)
+        else {
             panic!("rotate, drive, rotate");
         };
         let expected = [
@@ -415,22 +392,5 @@ mod tests {
                 );
             }
         }
-    }
-
-    #[test]
-    fn unsigned_rotations_predict_left_where_the_car_goes_right() {
-        let defects = Defects {
-            defect_unsigned_rotation: true,
-            ..Defects::default()
-        };
-        let right = Pose::new(0.2, -0.01, -0.1);
-        let at = mean(Motion::new(
-            right,
-            0.025,
-            1.0,
-            &MotionParameters::default(),
-            defects,
-        ));
-        assert!(at.y > 0.0);
     }
 }

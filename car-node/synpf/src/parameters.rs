@@ -12,7 +12,6 @@ use serde_json::Value;
 use localizer::{ParameterFault, ParameterValues};
 
 use crate::beam_layout::BeamParameters;
-use crate::defects::Defects;
 use crate::loss_detector::RecoveryParameters;
 use crate::motion_model::MotionParameters;
 use crate::particles::ParticleParameters;
@@ -45,14 +44,11 @@ pub struct Parameters {
     /// The search of the whole map.
     #[serde(flatten)]
     pub search: SearchParameters,
-    /// The reference's defects, all off but in `synpf-baseline`.
-    #[serde(flatten)]
-    pub defects: Defects,
 }
 
 impl Parameters {
     /// The names of the sets that ship.
-    pub const NAMES: [&'static str; 4] = ["hq", "lq", "adaptive", "synpf-baseline"];
+    pub const NAMES: [&'static str; 3] = ["hq", "lq", "adaptive"];
 
     /// A set that ships, by name.
     pub fn named(name: &str) -> Option<Self> {

@@ -17,8 +17,6 @@ pub(crate) const UNIT: f32 = 0.0025;
 pub(crate) struct TableParameters {
     /// Directions that differ; fewer than [`DIRECTIONS`] only to reproduce a coarser table.
     pub(crate) directions: u16,
-    /// Ranges come out half a cell long, as the reference's.
-    pub(crate) long_ranges: bool,
 }
 
 /// A range table for one region.
@@ -47,8 +45,7 @@ impl RangeTable {
             row_of[cell as usize] = row as u32;
         }
         let scale = grid.resolution as f32 / UNIT;
-        let bias = if parameters.long_ranges { 0.5 } else { 0.0 };
-        let stored = |range: f32| ((range + bias) * scale + 0.5) as u16;
+        let stored = |range: f32| (range * scale + 0.5) as u16;
         let faces = field.contour();
         // A free cell may lie behind a face where the map is grey. No laser is there: its ranges stay 0.
         let centres: Vec<(usize, [f32; 2])> = cells

@@ -210,10 +210,7 @@ mod tests {
     #[test]
     fn a_range_table_is_right_to_its_cell_its_directions_and_its_steps() {
         for (seed, directions) in [(2, 256), (3, 100)] {
-            let parameters = TableParameters {
-                directions,
-                long_ranges: false,
-            };
+            let parameters = TableParameters { directions };
             let build = |room: &Room| {
                 let free = |i: &u32| room.grid.cells[*i as usize] == Cell::Free;
                 let cells: Vec<u32> = (0..(SIDE * SIDE) as u32).filter(free).collect();

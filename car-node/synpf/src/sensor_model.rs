@@ -27,10 +27,10 @@ pub(crate) enum SensorModel {
 }
 
 impl SensorModel {
-    pub(crate) fn new(parameters: &Parameters, resolution: f64) -> Self {
+    pub(crate) fn new(parameters: &Parameters) -> Self {
         match parameters.sensor.sensor_model {
             SensorModelKind::Beam => Self::Beam {
-                model: Arc::new(BeamModel::new(&parameters.sensor, resolution, parameters.defects)),
+                model: Arc::new(BeamModel::new(&parameters.sensor)),
                 method: parameters.sensor.range_method,
             },
             SensorModelKind::LikelihoodField => {
@@ -44,7 +44,7 @@ impl SensorModel {
         let Self::Beam { method, .. } = self else {
             return Ranges::RayMarching;
         };
-        let table = parameters.sensor.table_parameters(parameters.defects);
+        let table = parameters.sensor.table_parameters();
         match (method, region) {
             (RangeMethod::Lut, Some(region)) => map
                 .range_table(region, table)

@@ -3,7 +3,6 @@
 use serde::{Deserialize, Serialize};
 
 use crate::cddt::DIRECTIONS;
-use crate::defects::Defects;
 use crate::range_table::TableParameters;
 use crate::validation::Check;
 
@@ -115,10 +114,9 @@ impl SensorParameters {
     }
 
     /// What the contents of a range table depend on.
-    pub(crate) fn table_parameters(&self, defects: Defects) -> TableParameters {
+    pub(crate) fn table_parameters(&self) -> TableParameters {
         TableParameters {
             directions: self.theta_discretization,
-            long_ranges: defects.defect_long_ranges,
         }
     }
 }

@@ -2,7 +2,6 @@
 //!
 //! [`SynPf::on_scan`] is the algorithm; each step of it is a function below it.
 
-mod reference_mode;
 mod stages;
 
 use std::sync::Arc;
@@ -14,7 +13,6 @@ use localizer::{
 use maps::{Pose, wrap_angle};
 use nalgebra::{Matrix3, Vector3};
 
-use self::reference_mode::PerOdometry;
 #[doc(hidden)]
 pub use self::stages::Stage;
 use crate::calibration::{Calibration, SlipModel};
@@ -50,7 +48,6 @@ pub struct SynPf {
     last_scan: Option<Stamp>,
     /// Updates so far.
     number: u64,
-    per_odometry: PerOdometry,
 }
 
 /// What one scan brings: its time, and the motion since the estimate.
@@ -108,7 +105,6 @@ impl SynPf {
             mode: Mode::Uninitialized,
             last_scan: None,
             number: 0,
-            per_odometry: PerOdometry::default(),
             map,
             parameters,
         })
@@ -117,9 +113,6 @@ impl SynPf {
     /// Takes in a scan and updates the pose.
     pub fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {
         let step = self.preprocess(scan)?;
-        if self.parameters.defects.defect_update_per_odometry && self.mode == Mode::Tracking {
-            return self.latest_of_odometry(&step);
-        }
         let predicted = self.predict(&step);
         let weighted = self.reweight(&predicted);
         let correction = self.fit(&step, &predicted, weighted.as_ref());
@@ -189,7 +182,7 @@ impl SynPf {
             } else {
                 calibration.slip_model = SlipModel::default();
             }
-            let motion = Motion::new(motion, seconds, factor, &parameters.motion, parameters.defects);
+            let motion = Motion::new(motion, seconds, factor, &parameters.motion);
             self.filter.predict(&motion);
         }
         predicted
@@ -450,11 +443,7 @@ impl SynPf {
     pub fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
         let use_imu = self.parameters.motion.use_imu;
         self.odometry
-            .push(odometry, use_imu, &self.calibration.slip_model)?;
-        if self.parameters.defects.defect_update_per_odometry {
-            self.update_per_odometry(odometry);
-        }
-        Ok(())
+            .push(odometry, use_imu, &self.calibration.slip_model)
     }
 
     /// Takes in a gyroscope's reading; used in place of odometry's yaw rate where the set says so. Cheap.

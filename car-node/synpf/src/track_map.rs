@@ -246,7 +246,7 @@ impl TrackMap {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Defects, Parameters};
+    use crate::Parameters;
 
     /// A room of 5 x 5 m.
     fn room() -> TrackMap {
@@ -260,7 +260,7 @@ mod tests {
     #[test]
     fn a_deferred_table_is_pending_until_somebody_builds_it() {
         let map = room().with_table_policy(TablePolicy::Defer);
-        let parameters = Parameters::default().sensor.table_parameters(Defects::default());
+        let parameters = Parameters::default().sensor.table_parameters();
         for _ in 0..3 {
             assert!(map.range_table(0, parameters).is_none());
         }
@@ -273,7 +273,7 @@ mod tests {
     #[test]
     fn a_table_is_built_at_once_where_results_must_not_depend_on_time() {
         let map = room();
-        let parameters = Parameters::default().sensor.table_parameters(Defects::default());
+        let parameters = Parameters::default().sensor.table_parameters();
         assert!(map.range_table(0, parameters).is_some());
         assert!(map.cddt().is_some());
         assert_eq!(map.pending_tables(), []);

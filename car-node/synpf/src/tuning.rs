@@ -21,7 +21,7 @@ impl Tuning {
     /// [`TrackMap::prepare`]; see [`Tuning::prepare`] for both at once.
     pub fn new(parameters: Parameters, map: &TrackMap) -> Result<Self, Vec<ParameterFault>> {
         parameters.validate()?;
-        let sensor_model = SensorModel::new(&parameters, map.grid().resolution);
+        let sensor_model = SensorModel::new(&parameters);
         Ok(Self {
             parameters,
             sensor_model,
@@ -67,7 +67,7 @@ impl TrackMap {
                 let at = map_from_base_link.map(|pose| self.region_at(self.grid_from_map() * pose));
                 let regions =
                     at.map_or_else(|| self.plausible_regions(), |region| region.into_iter().collect());
-                let parameters = parameters.sensor.table_parameters(parameters.defects);
+                let parameters = parameters.sensor.table_parameters();
                 let key = |region| TableKey::Ranges { region, parameters };
                 regions.into_iter().map(key).collect()
             }

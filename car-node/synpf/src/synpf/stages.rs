@@ -64,7 +64,6 @@ impl SynPf {
                 0.025,
                 1.0,
                 &parameters.motion,
-                parameters.defects,
             )),
             Stage::Reweight => {
                 let near = estimate.pose;

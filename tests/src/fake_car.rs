@@ -1,4 +1,4 @@
-//! A car made of nothing but protocol and zenoh: it drives in a circle and does as it is told.
+//! A car without a localizer: it drives in a circle, publishes messages and executes commands.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
@@ -18,26 +18,26 @@ use protocol::{
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
 
-/// What a fake car does wrong.
+/// The faults of a fake car.
 #[derive(Debug, Clone, Copy, Default)]
 #[expect(
     clippy::struct_excessive_bools,
-    reason = "each is a fault of its own, and they go together"
+    reason = "each is a fault of its own, and they can be combined"
 )]
 pub struct Behaviour {
     /// It does not answer commands.
-    pub mute: bool,
-    /// It publishes bytes that are no message, as load.
-    pub babbles: bool,
-    /// Its health messages are of a version that no pit wall knows yet.
-    pub newer: bool,
-    /// It keeps the full-rate streams and sends of them only what is asked for, as a car does over a slow link.
-    pub withholds: bool,
-    /// It starts so much later on its lap than the others, in updates of 25 ms.
-    pub behind: u64,
+    pub ignores_commands: bool,
+    /// Its load messages are malformed.
+    pub malformed_load: bool,
+    /// Its health messages have a version that no pit wall knows.
+    pub newer_health: bool,
+    /// It sends messages of the full-rate streams only on request, as a car does over a slow link.
+    pub withholds_recorded: bool,
+    /// Its distance behind the other cars on the lap, in updates of 25 ms.
+    pub updates_behind: u64,
 }
 
-/// A running fake car. Dropping it ends it without a good-bye.
+/// A running fake car. Dropping it ends it abruptly.
 pub struct FakeCar {
     name: CarName,
     state: Arc<Mutex<CarState>>,
@@ -46,10 +46,10 @@ pub struct FakeCar {
     session: Session,
 }
 
-/// What it has sent, and the set in force.
+/// The numbers of the messages sent, and the set in force.
 struct CarState {
     published: BTreeMap<Topic, u64>,
-    /// The messages of the streams that must be whole.
+    /// The messages of the recovered streams.
     archive: ReplayBuffer,
     set: SetRef,
     who: String,
@@ -74,16 +74,16 @@ impl CarState {
 const SETS: [&str; 2] = ["hq", "lq"];
 
 impl FakeCar {
-    /// A car called `mute`, which answers no command.
+    /// A car with the name `mute` that answers no command.
     pub async fn start_mute(endpoint: &str) -> Self {
         let behaviour = Behaviour {
-            mute: true,
+            ignores_commands: true,
             ..Behaviour::default()
         };
         Self::start("mute", endpoint, behaviour).await
     }
 
-    /// Dials the pit wall at `endpoint` and drives off.
+    /// Connects to the pit wall at `endpoint` and starts to drive.
     pub async fn start(name: &str, endpoint: &str, behaviour: Behaviour) -> Self {
         let name = CarName::new(name).expect("a good name");
         let session = zenoh::open(config(endpoint)).await.expect("a session");
@@ -99,7 +99,7 @@ impl FakeCar {
         }));
         let running = Arc::new(AtomicBool::new(true));
         let topics = Topics::declare(&session, &name, behaviour).await;
-        answer_questions(&session, &name, &state, behaviour).await;
+        declare_queryables(&session, &name, &state, behaviour).await;
         let driver = tokio::spawn(drive(topics, state.clone(), running.clone(), behaviour));
         Self {
             name,
@@ -125,17 +125,16 @@ impl FakeCar {
         self.state.lock().expect("no panic").set.clone()
     }
 
-    /// Stops publishing, and says what was the last number of each topic. The session stays, so that what was lost
-    /// can still be asked for.
+    /// Stops publishing. Returns the last number of each topic. Lost messages can still be requested.
     pub async fn stop_driving(&mut self) -> BTreeMap<Topic, u64> {
         self.running.store(false, Ordering::Relaxed);
         if let Some(driver) = self.driver.take() {
-            driver.await.expect("the car drives on");
+            driver.await.expect("the driving task did not panic");
         }
         self.published()
     }
 
-    /// Leaves.
+    /// Stops driving and disconnects.
     pub async fn leave(mut self) {
         self.stop_driving().await;
         self.session.close().await.expect("closed");
@@ -172,8 +171,8 @@ fn config(endpoint: &str) -> Config {
 struct Topics {
     session: Session,
     name: CarName,
-    withholds: bool,
-    newer: bool,
+    withholds_recorded: bool,
+    newer_health: bool,
     _alive: zenoh::liveliness::LivelinessToken,
 }
 
@@ -188,8 +187,8 @@ impl Topics {
         Self {
             session: session.clone(),
             name: name.clone(),
-            withholds: behaviour.withholds,
-            newer: behaviour.newer,
+            withholds_recorded: behaviour.withholds_recorded,
+            newer_health: behaviour.newer_health,
             _alive: alive,
         }
     }
@@ -197,7 +196,7 @@ impl Topics {
     async fn put(&self, topic: Topic, message: &impl Message, state: &Mutex<CarState>) {
         let stamps = state.lock().expect("no panic").stamps(topic);
         let mut bytes = encode(message, stamps).expect("a good message");
-        if self.newer && topic == Topic::Health {
+        if self.newer_health && topic == Topic::Health {
             // Behind the magic and the schema.
             bytes[6..8].copy_from_slice(&99_u16.to_le_bytes());
         }
@@ -205,7 +204,7 @@ impl Topics {
             let mut state = state.lock().expect("no panic");
             state.archive.keep(topic, stamps.sequence, bytes.clone());
         }
-        if topic.recorded() && self.withholds {
+        if topic.recorded() && self.withholds_recorded {
             return;
         }
         let key = Key::new(self.name.clone(), topic).to_string();
@@ -220,8 +219,8 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
     while running.load(Ordering::Relaxed) {
         ticks.tick().await;
         update += 1;
-        // Lap 1 has begun where it starts; those behind are on the lap before for a while.
-        let way = update + 80 - behaviour.behind % 80;
+        // A car starts in lap 1. Cars behind it are still in the lap before.
+        let way = update + 80 - behaviour.updates_behind % 80;
         let pose = pose(update, way);
         topics.put(Topic::Pose, &pose, &state).await;
         topics.put(Topic::RecordedPose, &pose, &state).await;
@@ -238,7 +237,7 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
         if update % 40 == 1 {
             let params = params(&state.lock().expect("no panic"));
             topics.put(Topic::Params, &params, &state).await;
-            if !behaviour.babbles {
+            if !behaviour.malformed_load {
                 topics.put(Topic::Load, &load(), &state).await;
             }
         }
@@ -256,7 +255,7 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
             };
             topics.put(Topic::Event, &event, &state).await;
         }
-        if behaviour.babbles && update % 40 == 1 {
+        if behaviour.malformed_load && update % 40 == 1 {
             let load = Key::new(topics.name.clone(), Topic::Load).to_string();
             topics.session.put(load, vec![0xff; 50]).await.expect("sent");
         }
@@ -266,7 +265,7 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
 /// Radius of the line that it drives \[m\], in a ring of walls a metre to either side.
 const RADIUS: f64 = 3.0;
 
-/// A lap of 2 s, 80 steps of its way.
+/// The pose at a step of its way. A lap has 80 steps and takes 2 s.
 fn pose(update: u64, way: u64) -> Pose {
     let angle = (way % 80) as f64 / 80.0 * TAU;
     Pose {
@@ -296,7 +295,7 @@ fn pose(update: u64, way: u64) -> Pose {
     }
 }
 
-/// The ring that it drives in.
+/// The map: a ring.
 fn ring() -> MapReply {
     const CELLS: u32 = 200;
     const CELL: f64 = 0.05;
@@ -332,7 +331,7 @@ fn ring() -> MapReply {
     }
 }
 
-/// As many end points as a car sends, on both walls.
+/// As many end points as a real car sends, on both walls.
 fn scan_view(pose: &Pose) -> ScanView {
     let centre = [pose.pose.x, pose.pose.y];
     let point = |i: usize| {
@@ -425,7 +424,7 @@ fn params(state: &CarState) -> Params {
     }
 }
 
-async fn answer_questions(
+async fn declare_queryables(
     session: &Session,
     name: &CarName,
     state: &Arc<Mutex<CarState>>,
@@ -463,7 +462,7 @@ async fn answer_questions(
                 .payload()
                 .map(|p| p.to_bytes().into_owned())
                 .unwrap_or_default();
-            // As with a real car, what cannot be read is not answered.
+            // Like a real car, it does not answer what it cannot read.
             let Ok((_, request)) = decode::<ClockRequest>(&payload) else {
                 return;
             };
@@ -503,18 +502,18 @@ async fn answer_questions(
         .await
         .expect("a queryable");
     for topic in [Topic::CmdParams, Topic::CmdPose, Topic::CmdRelocalize] {
-        obey_on(session, key(topic), state.clone(), behaviour).await;
+        execute_on(session, key(topic), state.clone(), behaviour).await;
     }
 }
 
-async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>>, behaviour: Behaviour) {
+async fn execute_on(session: &Session, commands: String, state: Arc<Mutex<CarState>>, behaviour: Behaviour) {
     let on = commands.clone();
     let unanswered = Mutex::new(Vec::new());
     session
         .declare_queryable(&on)
         .callback(move |query| {
-            if behaviour.mute {
-                // A query that is dropped is answered with nothing; one that is kept is not answered at all.
+            if behaviour.ignores_commands {
+                // Dropping a query ends it without a reply. Keeping it leaves it open.
                 unanswered.lock().expect("no panic").push(query);
                 return;
             }
@@ -522,11 +521,11 @@ async fn obey_on(session: &Session, commands: String, state: Arc<Mutex<CarState>
                 .payload()
                 .map(|p| p.to_bytes().into_owned())
                 .unwrap_or_default();
-            // As with a real car, what cannot be read is not obeyed.
+            // Like a real car, it does not execute what it cannot read.
             let Ok((_, command)) = decode::<Command>(&payload) else {
                 return;
             };
-            let answer = obey(&mut state.lock().expect("no panic"), &command);
+            let answer = execute(&mut state.lock().expect("no panic"), &command);
             respond(
                 &query,
                 &commands,
@@ -550,11 +549,11 @@ async fn reply_with(session: &Session, key: String, bytes: Vec<u8>) {
 
 fn respond(query: &zenoh::query::Query, key: &str, bytes: Vec<u8>) {
     use zenoh::Wait;
-    // Whoever asked may be gone, or the session about to close.
+    // The querier may be gone, or the session closing.
     drop(query.reply(key, bytes).wait());
 }
 
-fn obey(state: &mut CarState, command: &Command) -> Answer {
+fn execute(state: &mut CarState, command: &Command) -> Answer {
     let outcome = match (&command.action, command.expected_revision) {
         (_, Some(expected)) if expected != state.set.revision => Outcome::StaleRevision {
             expected,
@@ -593,7 +592,7 @@ fn obey(state: &mut CarState, command: &Command) -> Answer {
     }
 }
 
-/// Where it may be: three places of the ring that look alike.
+/// A possible pose: one of three places of the ring that look alike.
 fn candidate(number: u32) -> Candidate {
     let pose = pose(0, u64::from(number) * 26).pose;
     Candidate {

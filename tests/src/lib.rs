@@ -1,19 +1,22 @@
-//! Harness for whole-system tests: sessions on loopback that see nothing but each other, a car made of nothing but
-//! protocol, a whole one on a simulated track, a bag of a drive in a drawn room, the processor time that the host takes
-//! away, and waiting for conditions.
+//! Harness for whole-system tests.
+//!
+//! It gives pit walls and cars on private loopback endpoints, and two kinds of car: [`FakeCar`], which only speaks the
+//! protocol, and [`start_real`], a whole node on a simulated track. It also writes a bag of a drive through a small room
+//! ([`write_bag`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
+//! deadline ([`wait_until`]).
 
 #[cfg(feature = "browser")]
 mod browser;
 mod fake_car;
 mod real_car;
-mod stolen;
+mod steal_time;
 mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
 pub use real_car::start_real;
-pub use stolen::stolen;
+pub use steal_time::steal_time;
 pub use synthetic_bag::{room, true_pose, write_bag};
 
 use std::net::TcpListener;
@@ -21,11 +24,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use pitwall::{FleetService, Role};
-use protocol::{Action, CarName, ParamsAction};
+use pitwall::{FleetService, Role, Verdict, new_command_id};
+use protocol::{Action, CarName, Command, ParamsAction};
 use tempfile::TempDir;
 
-/// How long anything may take before a test gives up.
+/// How long a condition or an answer may take before a test fails. It is long, because machines may be busy.
 pub const DEADLINE: Duration = Duration::from_mins(1);
 
 /// A car's name.
@@ -33,14 +36,14 @@ pub fn named(name: &str) -> CarName {
     CarName::new(name).expect("a good name")
 }
 
-/// The set in force and its revision, as a pit wall knows them.
+/// The set in force and its revision, as the pit wall knows them.
 pub fn in_force(service: &FleetService, car: &CarName) -> Option<(String, u64)> {
     let fleet = service.fleet();
     let params = fleet.car(car)?.params.as_ref()?;
     Some((params.set.name.clone(), params.revision))
 }
 
-/// Puts a set in force, for good.
+/// The action that puts a set in force without a fall back.
 pub fn select(name: &str) -> Action {
     Action::Params(ParamsAction::Select {
         name: name.into(),
@@ -48,15 +51,34 @@ pub fn select(name: &str) -> Action {
     })
 }
 
-/// An endpoint on loopback that nobody else uses.
+/// Sends an action to a car and waits up to [`DEADLINE`] for its answer: on a busy machine, the answer may take longer
+/// than an operator would wait.
+pub async fn send_command(
+    service: &FleetService,
+    car: &CarName,
+    operator: &str,
+    expected_revision: Option<u64>,
+    action: Action,
+) -> Verdict {
+    let command = Command {
+        id: new_command_id(),
+        operator: operator.to_owned(),
+        expected_revision,
+        action,
+    };
+    let verdict = service.client().send(car, &command, DEADLINE).await;
+    verdict.expect("a valid command")
+}
+
+/// A free endpoint on loopback.
 pub fn free_endpoint() -> String {
-    // The system hands out a port that is free, and does not hand it out again soon.
+    // The system gives a free port, and does not give it again soon.
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     let address = listener.local_addr().expect("an address");
     format!("tcp/{address}")
 }
 
-/// A pit wall that listens there.
+/// The role of a pit wall that listens at `endpoint`.
 pub fn router(endpoint: &str) -> Role {
     Role::Router {
         listen: vec![endpoint.to_owned()],
@@ -64,14 +86,14 @@ pub fn router(endpoint: &str) -> Role {
     }
 }
 
-/// A program that joins the pit wall there.
+/// The role of a program that joins the pit wall at `endpoint`.
 pub fn client(endpoint: &str) -> Role {
     Role::Client {
         connect: vec![endpoint.to_owned()],
     }
 }
 
-/// A pit wall that records: where cars dial, and the folder with the file.
+/// A pit wall that records. Returns its endpoint, the pit wall, and the folder and path of the recording.
 pub async fn recording() -> (String, Arc<FleetService>, TempDir, PathBuf) {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
@@ -81,7 +103,7 @@ pub async fn recording() -> (String, Arc<FleetService>, TempDir, PathBuf) {
     (endpoint, service, folder, file)
 }
 
-/// Waits until `condition` holds; panics with `what` when it does not within [`DEADLINE`].
+/// Waits until `condition` holds. Panics with `what` if it does not within [`DEADLINE`].
 pub async fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + DEADLINE;
     while !condition() {

@@ -1,4 +1,4 @@
-//! A whole car, filter and all, on a simulated track.
+//! A whole car on a simulated track, with its localizer.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -9,7 +9,8 @@ use protocol::CarName;
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;
 
-/// Starts it at `start` \[m\] along the line of `club`; it dials the pit wall at `endpoint`, and keeps in `state` what survives a restart.
+/// Starts a car at `start` \[m\] along the line of `club`. It connects to the pit wall at `endpoint` and keeps its state in
+/// the folder `state`.
 pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Path>) -> Node {
     let track = Track::find("club", None).expect("bundled");
     let map = RaceMap {

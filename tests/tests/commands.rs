@@ -1,4 +1,4 @@
-//! Commands that can be trusted: whatever goes wrong, the car is in a known state, and whoever asked is told which.
+//! Commands under faults: the car always ends in a known state, and the operator is told which.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,7 +9,8 @@ use protocol::{
     Topic, Value, encode,
 };
 use system_tests::{
-    FakeCar, client, free_endpoint, in_force, named, router, select, start_real, stolen, wait_until,
+    FakeCar, client, free_endpoint, in_force, named, router, select, send_command, start_real, steal_time,
+    wait_until,
 };
 
 fn revision(verdict: &Verdict) -> u64 {
@@ -53,7 +54,6 @@ async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_
             expected_revision: expected,
             action: select(name),
         };
-        // A machine that stands still for a while is not what this looks for.
         let verdict = service
             .client()
             .send(&car, &command, system_tests::DEADLINE)
@@ -130,18 +130,14 @@ async fn two_pit_walls_that_switch_against_each_other_end_with_the_same_set() {
         assert!(service.wait_for(&car, system_tests::DEADLINE).await);
         wait_until("the set in force is known", || in_force(service, &car).is_some()).await;
     }
-    // Each switches to its own set, expecting what it last knew: of two at once, one is told to look again.
+    // Each switches to its own set and expects the revision that it last knew. Of two at once, one gets a conflict.
     let fight = |service: Arc<FleetService>, who: &'static str, name: &'static str| {
         let car = car.clone();
         tokio::spawn(async move {
             let (mut done, mut stale) = (0, 0);
             for _ in 0..50 {
                 let expected = in_force(&service, &car).map(|(_, revision)| revision);
-                let verdict = service
-                    .client()
-                    .command(&car, who, expected, select(name))
-                    .await
-                    .expect("a good command");
+                let verdict = send_command(&service, &car, who, expected, select(name)).await;
                 match verdict.exit_code() {
                     0 => done += 1,
                     6 => stale += 1,
@@ -183,7 +179,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         expected_revision: None,
         action: select("lq"),
     };
-    let patience = Duration::from_secs(10);
+    let patience = system_tests::DEADLINE;
     let send = async || {
         service
             .client()
@@ -191,11 +187,11 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
             .await
             .expect("a good command")
     };
-    // The answer is lost on its way: asked again, the car says the same.
+    // The answer was lost: sent again, the command gets the same answer.
     let done = send().await;
     let again = send().await;
     assert_eq!(revision(&done), revision(&again));
-    // The laptop dies while its command is under way: dropping the question is all that the car sees of that.
+    // The laptop dies while its command is in transit: the car only sees that the query ends.
     drop(tokio::time::timeout(Duration::ZERO, service.client().send(&car, &command, patience)).await);
 
     // The car's process ends, and comes back.
@@ -221,11 +217,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
         in_force(&service, &car).is_some_and(|(name, _)| name == "lq")
     })
     .await;
-    let back = service
-        .client()
-        .command(&car, "ana", None, select("hq"))
-        .await
-        .expect("a good command");
+    let back = send_command(&service, &car, "ana", None, select("hq")).await;
     let repeated = send().await;
     assert_eq!(
         revision(&repeated),
@@ -241,7 +233,7 @@ async fn a_command_is_not_done_twice_even_across_a_restart() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
+async fn no_answer_and_no_car_have_their_own_texts() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let mute = FakeCar::start_mute(&endpoint).await;
@@ -276,7 +268,7 @@ async fn no_answer_and_no_car_are_two_things_and_each_says_what_to_do() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
+async fn invalid_commands_are_refused_and_change_nothing() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = named("car-1");
@@ -328,11 +320,7 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
         (Action::Pose(far), "off the map"),
     ];
     for (action, word) in absurd {
-        let verdict = service
-            .client()
-            .command(&car, "ana", None, action.clone())
-            .await
-            .expect("a good command");
+        let verdict = send_command(&service, &car, "ana", None, action.clone()).await;
         assert_eq!(verdict.exit_code(), 3, "{action:?}: {verdict:?}");
         let text = verdict.text(&car);
         assert!(
@@ -340,22 +328,17 @@ async fn nonsense_is_refused_whole_counted_and_costs_no_update() {
             "{text}"
         );
     }
-    // Several faults are all told at once.
+    // Several faults are reported together.
     let both = put(&[
         ("sigma_hit", Value::Float(-1.0)),
         ("max_particles", Value::Int(-5)),
     ]);
-    let text = service
-        .client()
-        .command(&car, "ana", None, both)
-        .await
-        .expect("good")
-        .text(&car);
+    let text = send_command(&service, &car, "ana", None, both).await.text(&car);
     assert!(
         text.contains("sigma_hit") && text.contains("max_particles"),
         "{text}"
     );
-    // What is no number does not even leave the laptop.
+    // A value that is not finite is refused before it is sent.
     for value in [f64::NAN, f64::INFINITY] {
         let error = service
             .client()
@@ -425,16 +408,16 @@ async fn acknowledgements_with_three_cars() {
     for switch in 0..SWITCHES {
         for car in &cars {
             let name = if switch.is_multiple_of(2) { "lq" } else { "hq" };
-            let before = stolen();
+            let before = steal_time();
             let verdict = service
                 .client()
                 .command(car, "ana", None, select(name))
                 .await
-                .expect("a good command");
+                .expect("a valid command");
             match verdict {
                 Verdict::Answered { after_s, .. } => {
                     times.push(after_s * 1e3);
-                    if before.is_some() && stolen() == before {
+                    if before.is_some() && steal_time() == before {
                         undisturbed.push(after_s * 1e3);
                     }
                 }

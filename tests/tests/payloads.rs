@@ -1,4 +1,4 @@
-//! Bytes that are no message, on every key and both ways: refused, counted, said once, and neither side minds.
+//! Malformed messages on every key, in both directions: refused, counted, logged once, and without other effect.
 
 use std::time::Duration;
 
@@ -6,10 +6,10 @@ use pitwall::FleetService;
 use protocol::{
     Action, CarName, Command, CommandId, Key, LinkReport, Message, ParamsAction, Stamps, Topic, encode,
 };
-use system_tests::{free_endpoint, in_force, router, select, start_real, wait_until};
+use system_tests::{free_endpoint, in_force, router, select, send_command, start_real, wait_until};
 use zenoh::qos::CongestionControl;
 
-/// A program that belongs to nobody.
+/// A program that is neither car nor pit wall.
 async fn stranger(endpoint: &str) -> zenoh::Session {
     let mut config = zenoh::Config::default();
     for (key, value) in [
@@ -70,8 +70,8 @@ fn garbage() -> Vec<Vec<u8>> {
     garbage
 }
 
-/// What a car is asked or told.
-const ASKED: [Topic; 8] = [
+/// Topics that a car receives.
+const TO_CAR: [Topic; 8] = [
     Topic::Clock,
     Topic::Link,
     Topic::Missing,
@@ -82,8 +82,8 @@ const ASKED: [Topic; 8] = [
     Topic::CmdAuto,
 ];
 
-/// What a pit wall listens to.
-const HEARD: [Topic; 11] = [
+/// Topics that a pit wall receives.
+const TO_WALL: [Topic; 11] = [
     Topic::Pose,
     Topic::Cloud,
     Topic::Scan,
@@ -98,7 +98,7 @@ const HEARD: [Topic; 11] = [
 ];
 
 #[tokio::test(flavor = "multi_thread")]
-async fn garbage_on_every_key_is_refused_counted_and_said_once() {
+async fn malformed_messages_are_refused_counted_and_logged_once() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     service
@@ -130,7 +130,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     for topic in Topic::all() {
         let key = Key::new(car.clone(), topic).to_string();
         for bytes in &garbage {
-            // What a full queue drops on its way is not refused by anybody.
+            // Nothing may be dropped before it is refused.
             let sent = stranger.put(&key, bytes.clone());
             sent.congestion_control(CongestionControl::Block)
                 .await
@@ -141,7 +141,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
                 .timeout(Duration::from_secs(5))
                 .await
                 .expect("sent");
-            // One after the other: a full desk would not even look.
+            // One after the other: a full queue would drop them unread.
             while let Ok(reply) = replies.recv_async().await {
                 assert!(
                     reply.result().is_err() || matches!(topic, Topic::Map | Topic::Info),
@@ -151,8 +151,8 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
             }
         }
     }
-    // What the car is asked or told is counted on the car, and it says so with its load.
-    let expected = (ASKED.len() * garbage.len()) as u64;
+    // The car counts what it receives, and reports the count with its load.
+    let expected = (TO_CAR.len() * garbage.len()) as u64;
     let counted = || {
         let fleet = service.fleet();
         fleet
@@ -161,8 +161,8 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     };
     wait_until("every one of them is counted", || counted() >= Some(expected)).await;
     assert_eq!(counted(), Some(expected));
-    // What the pit wall listens to is counted there, and stands in the log once.
-    for topic in HEARD {
+    // The pit wall counts what it receives, and logs it once.
+    for topic in TO_WALL {
         wait_until(topic.as_str(), || {
             let views = service.fleet().view(pitwall::unix_now());
             let unreadable = views[0]
@@ -185,11 +185,7 @@ async fn garbage_on_every_key_is_refused_counted_and_said_once() {
     let last = updates();
     wait_until("the car drives on", || updates() > last + 40).await;
     assert_eq!(in_force(&service, &car), before);
-    let verdict = service
-        .client()
-        .command(&car, "ana", None, Action::Params(ParamsAction::List))
-        .await
-        .expect("a good command");
+    let verdict = send_command(&service, &car, "ana", None, Action::Params(ParamsAction::List)).await;
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     node.shutdown("test over");
     service.close().await;

@@ -1,11 +1,12 @@
-//! The pit wall against cars made of nothing but protocol.
+//! The pit wall with fake cars.
 
 use std::collections::BTreeMap;
 
 use pitwall::{FleetService, Report, Verdict, read_events, unix_now};
 use protocol::{CarName, Outcome, Topic};
 use system_tests::{
-    Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, recording, router, select, wait_until,
+    Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, named, recording, router, select,
+    send_command, wait_until,
 };
 
 #[tokio::test(flavor = "multi_thread")]
@@ -47,11 +48,7 @@ async fn a_second_program_joins_the_pit_wall_that_is_there() {
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
     let viewer = FleetService::open(&client(&endpoint)).await.expect("a link");
     assert!(viewer.wait_for(car.name(), DEADLINE).await);
-    let verdict = viewer
-        .client()
-        .command(car.name(), "ana", None, select("lq"))
-        .await
-        .expect("a good command");
+    let verdict = send_command(&viewer, car.name(), "ana", None, select("lq")).await;
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     assert_eq!(car.set().name, "lq");
     wait_until("both see the switch", || {
@@ -64,19 +61,14 @@ async fn a_second_program_joins_the_pit_wall_that_is_there() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn each_outcome_of_a_command_is_told_apart() {
+async fn each_outcome_of_a_command_has_its_own_text() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
     let mute = FakeCar::start_mute(&endpoint).await;
     assert!(service.wait_for(car.name(), DEADLINE).await && service.wait_for(mute.name(), DEADLINE).await);
-    let give = async |name: &CarName, expect, action| {
-        service
-            .client()
-            .command(name, "ana", expect, action)
-            .await
-            .expect("a good command")
-    };
+    let give =
+        async |name: &CarName, expect, action| send_command(&service, name, "ana", expect, action).await;
 
     let done = give(car.name(), Some(1), select("lq")).await;
     assert!(
@@ -88,8 +80,13 @@ async fn each_outcome_of_a_command_is_told_apart() {
         matches!(&refused, Verdict::Answered { answer, .. } if matches!(answer.outcome, Outcome::Refused { .. }))
     );
     let stale = give(car.name(), Some(1), select("hq")).await;
-    let none = give(&CarName::new("nobody").expect("a good name"), None, select("hq")).await;
-    let silent = give(mute.name(), None, select("hq")).await;
+    // These two wait as long as an operator does.
+    let wait = async |name: &CarName| {
+        let verdict = service.client().command(name, "ana", None, select("hq")).await;
+        verdict.expect("a valid command")
+    };
+    let none = wait(&named("nobody")).await;
+    let silent = wait(mute.name()).await;
 
     let codes: Vec<_> = [&done, &refused, &stale, &none, &silent]
         .map(Verdict::exit_code)
@@ -104,14 +101,14 @@ async fn each_outcome_of_a_command_is_told_apart() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bytes_that_are_no_message_are_counted_and_said_once() {
+async fn malformed_messages_are_counted_and_logged_once() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
-    let babbles = Behaviour {
-        babbles: true,
+    let malformed = Behaviour {
+        malformed_load: true,
         ..Behaviour::default()
     };
-    let car = FakeCar::start("car-1", &endpoint, babbles).await;
+    let car = FakeCar::start("car-1", &endpoint, malformed).await;
     wait_until("several payloads were refused", || {
         let view = service.fleet().car(car.name()).map(|car| car.view(unix_now()));
         view.and_then(|car| Some(car.streams.get("load")?.unreadable >= 3))
@@ -128,13 +125,13 @@ async fn bytes_that_are_no_message_are_counted_and_said_once() {
     service.close().await;
 }
 
-/// It was INIT, "no health message yet", for ever.
+/// Its state was INIT, "no health message yet", for ever.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_pit_wall_that_is_too_old_for_a_car_says_so() {
     let endpoint = free_endpoint();
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
     let newer = Behaviour {
-        newer: true,
+        newer_health: true,
         ..Behaviour::default()
     };
     let car = FakeCar::start("car-1", &endpoint, newer).await;
@@ -247,7 +244,7 @@ async fn a_recording_of_three_cars_holds_every_message() {
 async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
     let (endpoint, service, _folder, _) = recording().await;
     let slow = Behaviour {
-        withholds: true,
+        withholds_recorded: true,
         ..Behaviour::default()
     };
     let car = FakeCar::start("car-1", &endpoint, slow).await;

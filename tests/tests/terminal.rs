@@ -1,4 +1,4 @@
-//! The programs as processes: what the terminal says and ends with, and what is left when one is killed.
+//! The programs as processes: their output and exit codes, and the state after one was killed.
 
 use std::path::Path;
 use std::process::{Child, Command as Process, Output, Stdio};
@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use pitwall::{FleetService, Verdict, new_command_id};
 use protocol::{Action, CarName, Command, EventKind, Outcome, ParamsAction, Telemetry};
-use system_tests::{FakeCar, free_endpoint, named, router, select, wait_until};
+use system_tests::{FakeCar, free_endpoint, named, router, select, send_command, wait_until};
 
 /// A child that does not outlive the test.
 struct Killed(Child);
@@ -94,7 +94,7 @@ async fn driving(service: &FleetService, car: &CarName) {
     reason = "a table of command lines, which reads best in one piece"
 )]
 #[tokio::test(flavor = "multi_thread")]
-async fn each_outcome_has_its_exit_code_and_its_words() {
+async fn each_outcome_has_its_exit_code_and_text() {
     let endpoint = free_endpoint();
     let folder = tempfile::tempdir().expect("a folder");
     let service = FleetService::open(&router(&endpoint)).await.expect("a link");
@@ -277,11 +277,7 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         }
         laptop.kill();
         // The next one is told what is in force, and what it is told is what the car does.
-        let verdict = service
-            .client()
-            .command(&real, "ben", None, Action::Params(ParamsAction::List))
-            .await
-            .expect("a good command");
+        let verdict = send_command(&service, &real, "ben", None, Action::Params(ParamsAction::List)).await;
         let Verdict::Answered { answer, .. } = verdict else {
             panic!("{verdict:?}");
         };
@@ -292,7 +288,7 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         // Given again, it ends in the set that was wanted.
         let again = service
             .client()
-            .send(&real, &command(name), pitwall::REPLY_TIMEOUT)
+            .send(&real, &command(name), system_tests::DEADLINE)
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{again:?}");
@@ -306,7 +302,7 @@ async fn a_laptop_killed_mid_command_leaves_the_set_before_or_the_set_after() {
         })
         .await;
     }
-    // Whose doing it was stands in the log.
+    // The log names the operator.
     let said = service
         .fleet()
         .log()
@@ -350,11 +346,7 @@ async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_
         wait_until("the car is gone", || in_force(&service, &real).is_none()).await;
         node = car("car-1", &endpoint, folder.path());
         driving(&service, &real).await;
-        let known = service
-            .client()
-            .command(&real, "ben", None, Action::Params(ParamsAction::List))
-            .await
-            .expect("a good command");
+        let known = send_command(&service, &real, "ben", None, Action::Params(ParamsAction::List)).await;
         let Verdict::Answered { answer, .. } = known else {
             panic!("{known:?}");
         };
@@ -366,7 +358,7 @@ async fn a_car_killed_mid_command_comes_back_in_a_known_set_and_the_operator_is_
         // The same command once more: done now, or answered as it was done then.
         let again = service
             .client()
-            .send(&real, &command, pitwall::REPLY_TIMEOUT)
+            .send(&real, &command, system_tests::DEADLINE)
             .await
             .expect("good");
         assert_eq!(again.exit_code(), 0, "{}", again.text(&real));

@@ -9,7 +9,7 @@ use car_node::sensors::bag::{Bag, Topics};
 use pitwall::{EventPayload, Verdict, read_events};
 use protocol::{Action, CarName, ParamsAction, Telemetry, Topic};
 use synpf::TrackMap;
-use system_tests::{DEADLINE, recording, room, true_pose, wait_until, write_bag};
+use system_tests::{DEADLINE, recording, room, send_command, true_pose, wait_until, write_bag};
 
 /// Starts a car that plays the bag in `folder`.
 fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
@@ -54,11 +54,7 @@ async fn a_bag_becomes_poses_at_the_pit_wall_and_in_the_recording() {
         name: "lq".into(),
         revert_after_ms: None,
     });
-    let verdict = service
-        .client()
-        .command(&car, "ana", None, select)
-        .await
-        .expect("a good command");
+    let verdict = send_command(&service, &car, "ana", None, select).await;
     let Verdict::Answered { answer, .. } = &verdict else {
         panic!("no answer: {verdict:?}");
     };
@@ -157,7 +153,7 @@ fn position_rmse(file: &Path) -> (f64, usize) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn three_cars_are_recorded_without_a_hole() {
+async fn three_cars_are_recorded_without_a_gap() {
     let (endpoint, service, folder, _) = recording().await;
     let nodes: Vec<_> = ["car-1", "car-2", "car-3"]
         .map(|name| start(name, folder.path(), &endpoint))

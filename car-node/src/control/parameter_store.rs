@@ -594,7 +594,7 @@ mod tests {
                 _ => {
                     let values =
                         (0..self.roll(4)).map(|_| (keys[self.roll(keys.len())].clone(), self.value()));
-                    let values: std::collections::BTreeMap<String, Value> = values.collect();
+                    let values: BTreeMap<String, Value> = values.collect();
                     ParamsAction::Put {
                         set: ParameterSet {
                             name,

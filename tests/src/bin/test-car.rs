@@ -1,9 +1,9 @@
-//! Cars in a process of their own, so that a test can kill one as a power cut does.
+//! Cars in a process of their own, which a test can kill as a power cut does.
 //!
 //! ```text
 //! test-car race NAME START ENDPOINT [STATE]   a real node in a simulated car on the bundled track; STATE is the folder
 //!                                             that its sets are kept in
-//! test-car rings COUNT ENDPOINT               cars made of nothing but protocol, car-1 to car-COUNT, at full rate
+//! test-car rings COUNT ENDPOINT               fake cars, car-1 to car-COUNT, at full rate
 //! ```
 
 use std::path::Path;
@@ -13,7 +13,7 @@ use anyhow::{Context, bail};
 use protocol::CarName;
 use system_tests::{Behaviour, FakeCar, start_real};
 
-/// Nobody is served by a car that outlives a test that was killed.
+/// The process ends after this time, in case the test was killed.
 const LONGEST: Duration = Duration::from_mins(10);
 
 fn main() -> anyhow::Result<()> {
@@ -46,7 +46,7 @@ fn rings(count: u64, endpoint: &str) -> anyhow::Result<()> {
         let mut cars = Vec::new();
         for number in 1..=count {
             let behaviour = Behaviour {
-                behind: number * 80 / count.max(1),
+                updates_behind: number * 80 / count.max(1),
                 ..Behaviour::default()
             };
             cars.push(FakeCar::start(&format!("car-{number:02}"), endpoint, behaviour).await);

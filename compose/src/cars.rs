@@ -9,7 +9,7 @@ use car_node::node::{Begin, Node, NodeConfig, RaceMap};
 use car_node::sensors::{Incident, Race, ScriptedIncident};
 use protocol::CarName;
 use simulator::{CarSetup, DriverParams, Grip, Guidance, OdometryParams, Track, YawSource};
-use synpf::TrackMap;
+use synpf::{TablePolicy, TrackMap};
 
 use crate::Options;
 
@@ -28,7 +28,7 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
     let track = Track::find(&options.track, None)?;
     let map = RaceMap {
         name: track.name.clone(),
-        map: Arc::new(TrackMap::new(track.grid.clone())?),
+        map: Arc::new(TrackMap::new(track.grid.clone())?.with_table_policy(TablePolicy::Defer)),
         raceline: Some(Arc::new(track.raceline.clone())),
     };
     let count = usize::from(options.cars);

@@ -13,7 +13,7 @@ use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
 use simulator::{CarSetup, Grip, OdometryParams, YawSource};
-use synpf::TrackMap;
+use synpf::{TablePolicy, TrackMap};
 
 use crate::cli::{Odometry, Run, SourceKind};
 
@@ -198,7 +198,7 @@ fn map_file(arguments: &Run) -> anyhow::Result<RaceMap> {
 fn race_map(name: String, grid: OccupancyGrid, raceline: Option<Raceline>) -> anyhow::Result<RaceMap> {
     Ok(RaceMap {
         name,
-        map: Arc::new(TrackMap::new(grid)?),
+        map: Arc::new(TrackMap::new(grid)?.with_table_policy(TablePolicy::Defer)),
         raceline: raceline.map(Arc::new),
     })
 }

@@ -14,6 +14,7 @@ use super::filter_command::{FilterCommand, LocalizerChange};
 use super::lap_counter::LapCounter;
 use super::pace::Pace;
 use super::shadow_channel::{ShadowInput, ShadowScan, ShadowSender};
+use super::table_worker::TableWorker;
 use super::views;
 use crate::health::{Monitor, Proposal, SetRecommender, SlipEvent, SlipTracker, State};
 use crate::sensors::bag::SensorEvent;
@@ -77,6 +78,7 @@ struct FilterWorker {
     last_state: State,
     last_odometry: Option<Pose>,
     listed: Listed,
+    tables: TableWorker,
 }
 
 /// Health is checked at least this often, sensor data or not.
@@ -88,6 +90,7 @@ pub fn start(
     feed: Receiver<Feed>,
     commands: Receiver<FilterCommand>,
 ) -> std::io::Result<JoinHandle<()>> {
+    let tables = TableWorker::start(Arc::clone(&config.map))?;
     thread::Builder::new().name("filter".into()).spawn(move || {
         let last_state = config.monitor.verdict().state;
         FilterWorker {
@@ -100,6 +103,7 @@ pub fn start(
             last_state,
             last_odometry: None,
             listed: Listed::default(),
+            tables,
         }
         .run(feed, &commands);
     })
@@ -305,6 +309,7 @@ impl FilterWorker {
         let before = Instant::now();
         let result = self.config.localizer.on_scan(&scan);
         let taken = before.elapsed().as_secs_f64();
+        self.tables.build_pending();
         let now = self.now();
         let rates = self.rates();
         let update = match result {

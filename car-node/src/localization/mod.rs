@@ -7,6 +7,7 @@ mod localizer_parameters;
 mod pace;
 pub mod shadow;
 pub mod shadow_channel;
+pub mod table_worker;
 mod views;
 
 pub use localizer_parameters::{KIND_KEY, LocalizerParameters};

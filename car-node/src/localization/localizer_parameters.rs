@@ -149,9 +149,7 @@ impl LocalizerParameters {
     ) -> Result<PreparedParameters, Vec<ParameterFault>> {
         self.prepare_tables(map, map_from_base_link);
         Ok(match self {
-            Self::SynPf(parameters) => {
-                PreparedParameters::new(Tuning::new(Parameters::clone(parameters), map)?)
-            }
+            Self::SynPf(parameters) => PreparedParameters::new(Tuning::new(Parameters::clone(parameters))?),
             Self::Reference(parameters) => {
                 PreparedParameters::new(ReferenceTuning::new(ReferenceParameters::clone(parameters), map)?)
             }

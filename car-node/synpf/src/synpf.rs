@@ -93,7 +93,7 @@ impl SynPf {
         let Tuning {
             parameters,
             sensor_model,
-        } = Tuning::new(parameters, &map).map_err(SetUpError::Parameters)?;
+        } = Tuning::new(parameters).map_err(SetUpError::Parameters)?;
         Ok(Self {
             base_link_from_laser,
             odometry: OdometryTrack::default(),
@@ -413,7 +413,7 @@ impl SynPf {
     /// Swaps the parameter set between two updates; the particles stay. On `Err` nothing has changed. Builds the
     /// tables of the sensor model, which takes some milliseconds; see [`SynPf::tune`] to have that done elsewhere.
     pub fn set_parameters(&mut self, parameters: Parameters) -> Result<(), Vec<ParameterFault>> {
-        self.tune(Tuning::new(parameters, &self.map)?);
+        self.tune(Tuning::new(parameters)?);
         Ok(())
     }
 

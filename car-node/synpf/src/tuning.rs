@@ -19,7 +19,7 @@ pub struct Tuning {
 impl Tuning {
     /// Validates a set and builds its sensor model. Every fault is listed. The range tables are the map's and built by
     /// [`TrackMap::prepare`]; see [`Tuning::prepare`] for both at once.
-    pub fn new(parameters: Parameters, map: &TrackMap) -> Result<Self, Vec<ParameterFault>> {
+    pub fn new(parameters: Parameters) -> Result<Self, Vec<ParameterFault>> {
         parameters.validate()?;
         let sensor_model = SensorModel::new(&parameters);
         Ok(Self {
@@ -35,7 +35,7 @@ impl Tuning {
         map: &TrackMap,
         map_from_base_link: Option<Pose>,
     ) -> Result<PreparedParameters, Vec<ParameterFault>> {
-        let tuning = Self::new(parameters, map)?;
+        let tuning = Self::new(parameters)?;
         map.prepare(map_from_base_link, &tuning.parameters);
         Ok(PreparedParameters::new(tuning))
     }

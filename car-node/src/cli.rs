@@ -197,7 +197,8 @@ pub(crate) struct Evaluate {
     /// black-tubes; may be repeated.
     #[arg(long, value_name = "KIND@S+S", allow_hyphen_values = true)]
     pub(crate) fault: Vec<Fault>,
-    /// Write `stamp_s,x_m,y_m,heading_rad` of base_link at every update to this CSV file (one bag, one seed).
+    /// Write every update to this CSV file (one bag, one seed): stamp_s,x_m,y_m,heading_rad of base_link, the covariance
+    /// xx,xy,yy,xh,yh,hh, the state and the mode, and the scan's fit align,short,long.
     #[arg(long, value_name = "OUT.csv")]
     pub(crate) poses: Option<PathBuf>,
     /// One JSON object on stdout; an array of them for several bags or seeds.

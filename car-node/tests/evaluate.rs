@@ -222,7 +222,10 @@ fn a_drive_is_localized_measured_and_repeatable() {
 
     let text = fs::read_to_string(&poses).expect("written");
     let mut lines = text.lines();
-    assert_eq!(lines.next(), Some("stamp_s,x_m,y_m,heading_rad"));
+    assert_eq!(
+        lines.next(),
+        Some("stamp_s,x_m,y_m,heading_rad,xx,xy,yy,xh,yh,hh,state,mode,align,short,long")
+    );
     assert_eq!(lines.count() as u64, updates);
     assert!(text.contains("\n1700000000.050000000,"), "stamps are the scans'");
 

@@ -88,7 +88,7 @@ fn judge(log: &SensorLog, grid: OccupancyGrid, off: Pose) -> Outcome {
     let mut localizer = localizer(&map, log.mount.expect("known"));
     let truth = Truth::new(log.truth.clone());
     let start = Start::Pose(log.truth[0].1 * off);
-    evaluate::run(localizer.as_mut(), &log.arrivals, &truth, start, |_, _| ()).expect("runs")
+    evaluate::run(localizer.as_mut(), &log.arrivals, &truth, start, |_, _, _| ()).expect("runs")
 }
 
 fn judge_here(log: &SensorLog) -> Outcome {

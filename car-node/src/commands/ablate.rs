@@ -124,7 +124,7 @@ fn over(
         &log.arrivals,
         truth,
         start,
-        |_, _| {},
+        |_, _, _| {},
     )?)
 }
 

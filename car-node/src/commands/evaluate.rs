@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use car_node::evaluate::{Fault, FaultReport, Outcome, Start, Truth, run as run_over};
+use car_node::evaluate::{Fault, FaultReport, Nees, Outcome, Start, Truth, run as run_over};
+use car_node::health::State;
 use car_node::sensors::bag::SensorLog;
 use car_node::statistics::ErrorSummary;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -146,16 +147,22 @@ fn over_bag(
     progress: &ProgressBar,
 ) -> anyhow::Result<Outcome> {
     let mut failed = None;
-    let outcome = run_over(localizer, &log.arrivals, truth, start, |update, done| {
-        if update.number.is_multiple_of(64) {
-            progress.set_position((done * 1000.0) as u64);
-        }
-        if let Some(poses) = &mut poses
-            && let Err(error) = poses.write(update)
-        {
-            failed.get_or_insert(error);
-        }
-    });
+    let outcome = run_over(
+        localizer,
+        &log.arrivals,
+        truth,
+        start,
+        |update, state, done| {
+            if update.number.is_multiple_of(64) {
+                progress.set_position((done * 1000.0) as u64);
+            }
+            if let Some(poses) = &mut poses
+                && let Err(error) = poses.write(update, state)
+            {
+                failed.get_or_insert(error);
+            }
+        },
+    );
     progress.finish_and_clear();
     if let Some(poses) = poses {
         failed
@@ -176,6 +183,10 @@ fn progress_bar(bag: &Path, seed: u64) -> ProgressBar {
     bar
 }
 
+/// The columns of `--poses`: the pose, its covariance in m^2, m rad and rad^2, the health state, the localizer's mode, and
+/// the scan's alignment and shares of short and long beams.
+const COLUMNS: &str = "stamp_s,x_m,y_m,heading_rad,xx,xy,yy,xh,yh,hh,state,mode,align,short,long";
+
 /// The CSV file of `--poses`.
 struct PoseFile {
     path: PathBuf,
@@ -186,23 +197,31 @@ impl PoseFile {
     fn create(path: &Path) -> anyhow::Result<Self> {
         let file = File::create(path).with_context(|| path.display().to_string())?;
         let mut file = BufWriter::new(file);
-        writeln!(file, "stamp_s,x_m,y_m,heading_rad").with_context(|| path.display().to_string())?;
+        writeln!(file, "{COLUMNS}").with_context(|| path.display().to_string())?;
         Ok(Self {
             path: path.into(),
             file,
         })
     }
 
-    fn write(&mut self, update: &Update) -> std::io::Result<()> {
+    fn write(&mut self, update: &Update, state: State) -> std::io::Result<()> {
         let (seconds, nanoseconds) = (
             update.stamp.0.div_euclid(1_000_000_000),
             update.stamp.0.rem_euclid(1_000_000_000),
         );
         let pose = update.pose;
-        writeln!(
+        write!(
             self.file,
             "{seconds}.{nanoseconds:09},{:.6},{:.6},{:.6}",
             pose.x, pose.y, pose.heading
+        )?;
+        for (row, column) in [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)] {
+            write!(self.file, ",{:.6e}", update.covariance[(row, column)])?;
+        }
+        writeln!(
+            self.file,
+            ",{state:?},{:?},{:.4},{:.4},{:.4}",
+            update.mode, update.alignment, update.short_beams, update.long_beams
         )
     }
 }
@@ -240,6 +259,17 @@ fn print_one(report: &Report) {
             line("longitudinal", "cm", 100.0, &errors.longitudinal_error_m);
             line("heading", "deg", 1_f64.to_degrees(), &errors.heading_error_rad);
             say!("  excursions   {:>9}", errors.excursions);
+            if let Some(nees) = &outcome.nees {
+                let line = |name: &str, dimension: u32, of: &Nees| {
+                    say!(
+                        "  {name:<12} {:>9.2}  NEES, {dimension} if honest; {:.1}% above the 95% bound",
+                        of.mean,
+                        of.above_95 * 100.0
+                    );
+                };
+                line("position", 2, &nees.position);
+                line("heading", 1, &nees.heading);
+            }
         }
         None => say!("  error        no truth to compare with"),
     }

@@ -2,6 +2,7 @@
 //! the times taken).
 
 pub mod ablation;
+mod consistency;
 mod errors;
 mod faults;
 mod pose_file;
@@ -15,11 +16,14 @@ use maps::Pose;
 use serde::Serialize;
 use synpf::{Dropped, Localizer, PoseError, Stamp, Update};
 
+pub use consistency::{Consistency, Nees};
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
 pub use pose_file::{PoseFileError, read_poses};
 pub use states::{FaultReport, StateChange, StateTruth, States};
 pub use truth::Truth;
+
+use consistency::ConsistencyCheck;
 
 use crate::health::{Monitor, State, Thresholds};
 use crate::sensors::bag::{Arrival, SensorEvent};
@@ -75,6 +79,9 @@ pub struct Outcome {
     /// Errors against the truth, where there is any.
     #[serde(flatten)]
     pub errors: Option<Summaries>,
+    /// Consistency of the covariance, where there is truth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub nees: Option<Consistency>,
     /// Share of the updates spent in each health state.
     pub state_share: BTreeMap<State, f64>,
     /// Every change of the health state.
@@ -104,13 +111,13 @@ pub enum EvaluateError {
     Start(#[from] PoseError),
 }
 
-/// Runs `localizer` over `arrivals`. `observe` sees every update and the share of the log done so far.
+/// Runs `localizer` over `arrivals`. `observe` sees every update, the health state after it, and the share of the log done so far.
 pub fn run(
     localizer: &mut dyn Localizer,
     arrivals: &[Arrival],
     truth: &Truth,
     start: Start,
-    mut observe: impl FnMut(&Update, f64),
+    mut observe: impl FnMut(&Update, State, f64),
 ) -> Result<Outcome, EvaluateError> {
     let mut dropped = BTreeMap::new();
     let mut errors = PoseErrors::default();
@@ -120,6 +127,7 @@ pub fn run(
     let begin_at = arrivals.first().map_or(Stamp(0), |arrival| arrival.log_time);
     let mut monitor = Monitor::new(Thresholds::default(), begin_at);
     let mut states = States::default();
+    let mut consistency = ConsistencyCheck::default();
 
     for (index, arrival) in arrivals.iter().enumerate() {
         // A car looks at its clock all the time; a log has one only where something arrives.
@@ -154,12 +162,13 @@ pub fn run(
                 result.map(|update| {
                     let true_pose = truth.at(update.stamp);
                     errors.push(update.stamp, update.pose, true_pose);
+                    consistency.push(&update, true_pose);
                     let state = monitor.on_update(&update, arrival.log_time).state;
                     states.push(update.stamp, state, update.pose, true_pose);
                     alignment.push(update.alignment);
                     times_us.push(microseconds(taken));
                     particles.push(update.particles as f64);
-                    observe(&update, (index + 1) as f64 / arrivals.len() as f64);
+                    observe(&update, state, (index + 1) as f64 / arrivals.len() as f64);
                 })
             }
         };
@@ -172,6 +181,7 @@ pub fn run(
         scans,
         updates: times_us.len(),
         dropped,
+        nees: consistency.summary(),
         state_share: states.shares(),
         state_changes: states.changes().to_vec(),
         state_truth: states.truth(),

@@ -147,22 +147,16 @@ fn over_bag(
     progress: &ProgressBar,
 ) -> anyhow::Result<Outcome> {
     let mut failed = None;
-    let outcome = run_over(
-        localizer,
-        &log.arrivals,
-        truth,
-        start,
-        |update, state, done| {
-            if update.number.is_multiple_of(64) {
-                progress.set_position((done * 1000.0) as u64);
-            }
-            if let Some(poses) = &mut poses
-                && let Err(error) = poses.write(update, state)
-            {
-                failed.get_or_insert(error);
-            }
-        },
-    );
+    let outcome = run_over(localizer, &log.arrivals, truth, start, |update, state, done| {
+        if update.number.is_multiple_of(64) {
+            progress.set_position((done * 1000.0) as u64);
+        }
+        if let Some(poses) = &mut poses
+            && let Err(error) = poses.write(update, state)
+        {
+            failed.get_or_insert(error);
+        }
+    });
     progress.finish_and_clear();
     if let Some(poses) = poses {
         failed

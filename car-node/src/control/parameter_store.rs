@@ -393,8 +393,6 @@ fn parameter_set(name: &str, parameters: &LocalizerParameters) -> ParameterSet {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use super::*;
     use protocol::Value;
 
@@ -594,7 +592,7 @@ mod tests {
                 _ => {
                     let values =
                         (0..self.roll(4)).map(|_| (keys[self.roll(keys.len())].clone(), self.value()));
-                    let values: BTreeMap<String, Value> = values.collect();
+                    let values: std::collections::BTreeMap<String, Value> = values.collect();
                     ParamsAction::Put {
                         set: ParameterSet {
                             name,

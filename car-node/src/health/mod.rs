@@ -4,7 +4,7 @@
 //! ```text
 //!            first pose            0.5 s good and 1 m driven
 //!   INIT ------------> CONVERGING --------------------------> LOCALIZED <----> DEGRADED
-//!                        ^    |                                   any metric bad for 3 scans; 0.5 s good
+//!                        ^    |                                   any metric bad for 0.04 s; 0.5 s good
 //!        a pose is found |    | the pose is wrong, see below (from any of the three)
 //!                        |    v
 //!              RELOCALIZING <-- LOST            STALE: no sensor data, from any of them

@@ -40,8 +40,8 @@ pub struct Monitor {
     last_odometry: Option<Stamp>,
     /// Findings of the last update.
     findings: Vec<Finding>,
-    /// For how many scans on end each kind was found.
-    streaks: HashMap<CauseKind, u32>,
+    /// Since when each kind has been found without a break.
+    found_since: HashMap<CauseKind, Stamp>,
     /// The fit, smoothed over the longer and the shorter time.
     fit: Option<[ScanFit; 2]>,
     /// Since when each family has said that the pose is wrong.
@@ -53,8 +53,8 @@ pub struct Monitor {
     /// Driven since the state was entered and since anything was wrong [m].
     driven: f64,
     last_update: Option<Stamp>,
-    /// Scans refused in a row.
-    refused: u32,
+    /// Since when every scan has been refused, and when the last one was.
+    refused: Option<[Stamp; 2]>,
     ages: VecDeque<(Stamp, f64)>,
     /// When odometry jumped last, and by how far [m].
     jumped: Option<(Stamp, f64)>,
@@ -79,14 +79,14 @@ impl Monitor {
             last_scan: None,
             last_odometry: None,
             findings: Vec::new(),
-            streaks: HashMap::new(),
+            found_since: HashMap::new(),
             fit: None,
             lost_since: [None; Family::COUNT],
             wrong_since: None,
             good_since: None,
             driven: 0.0,
             last_update: None,
-            refused: 0,
+            refused: None,
             ages: VecDeque::new(),
             jumped: None,
             leapt: None,
@@ -112,7 +112,8 @@ impl Monitor {
     /// A scan has come in at `now` and was refused.
     pub fn on_refused_scan(&mut self, now: Stamp) {
         self.last_scan = Some(now);
-        self.refused = self.refused.saturating_add(1);
+        let [first, _] = self.refused.unwrap_or([now; 2]);
+        self.refused = Some([first, now]);
     }
 
     /// The localizer was given a new pose.
@@ -130,7 +131,7 @@ impl Monitor {
     /// A scan has come in and led to an update; its pose was ready at `now`.
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.last_scan = Some(now);
-        self.refused = 0;
+        self.refused = None;
         if let Some([distance, _]) = update.odometry_jump {
             self.jumped = Some((now, distance));
         }
@@ -151,7 +152,7 @@ impl Monitor {
             good: self.verdict.state == State::Localized,
         };
         self.findings = findings(&evidence, &self.thresholds);
-        self.count(fast, update.stamp);
+        self.note_times(fast, update.stamp);
         // By odometry: the estimate of a wrong pose slides about while the car stands.
         if let (Some(_), Some(last)) = (self.good_since, self.last_update) {
             self.driven += update.twist.linear_x.abs() * update.stamp.since(last).max(0.0);
@@ -181,6 +182,8 @@ impl Monitor {
         let stale = self.verdict.state == State::Stale;
         if silent && !stale && self.verdict.state != State::Init {
             self.before_stale = self.verdict.state;
+            // Findings from before a silence do not last across it.
+            self.found_since.clear();
             self.enter(State::Stale, now);
         } else if !silent && stale {
             // Odometry has carried a tracked pose across the gap; anything else starts again.
@@ -234,13 +237,13 @@ impl Monitor {
         metrics.age_p99 = percentile(&ages, 0.99).unwrap_or_default();
     }
 
-    /// Counts scans on end, and since when families have spoken and when nothing has been wrong.
-    fn count(&mut self, fit: ScanFit, stamp: Stamp) {
+    /// Notes since when each kind was found, each family points to a wrong pose, and nothing has been wrong.
+    fn note_times(&mut self, fit: ScanFit, stamp: Stamp) {
         let findings = &self.findings;
-        self.streaks
+        self.found_since
             .retain(|kind, _| findings.iter().any(|finding| finding.kind == *kind));
         for finding in findings {
-            *self.streaks.entry(finding.kind).or_default() += 1;
+            self.found_since.entry(finding.kind).or_insert(stamp);
         }
         let note = |since: &mut Option<Stamp>, holds: bool| {
             if holds {
@@ -315,9 +318,10 @@ impl Monitor {
     fn lasting(&self, finding: &Finding) -> bool {
         finding.degrades
             && self
-                .streaks
+                .found_since
                 .get(&finding.kind)
-                .is_some_and(|scans| *scans >= self.thresholds.bad_scans)
+                .zip(self.last_update)
+                .is_some_and(|(since, last)| last.since(*since) >= self.thresholds.bad_for)
     }
 
     /// Which sensors are silent, with the time since they last spoke [s].
@@ -357,7 +361,11 @@ impl Monitor {
             State::Relocalizing => causes.push(plain(CauseKind::Searching, Severity::Warning)),
             State::Localized | State::Degraded | State::Lost | State::Stale => {}
         }
-        if self.refused >= self.thresholds.bad_scans && self.verdict.state != State::Init {
+        if self
+            .refused
+            .is_some_and(|[first, last]| last.since(first) >= self.thresholds.bad_for)
+            && self.verdict.state != State::Init
+        {
             causes.push(plain(CauseKind::BadSensorData, Severity::Warning));
         }
         if let Some((at, distance)) = self.jumped
@@ -403,15 +411,22 @@ mod tests {
         monitor: Monitor,
         now: Stamp,
         number: u64,
+        /// From one scan to the next [s].
+        period: f64,
     }
 
     impl Drive {
         fn new() -> Self {
+            Self::at(SCAN)
+        }
+
+        fn at(period: f64) -> Self {
             let now = Stamp(1_000_000_000);
             Self {
                 monitor: Monitor::new(Thresholds::default(), now),
                 now,
                 number: 0,
+                period,
             }
         }
 
@@ -423,7 +438,7 @@ mod tests {
             };
             Update {
                 twist,
-                pose: Pose::new(self.number as f64 * 2.0 * SCAN, 0.0, 0.0),
+                pose: Pose::new(self.number as f64 * 2.0 * self.period, 0.0, 0.0),
                 ..good_update(self.now, self.number)
             }
         }
@@ -431,8 +446,8 @@ mod tests {
         /// Drives for some seconds on updates changed by `change`; the states on the way.
         fn drive(&mut self, seconds: f64, change: impl Fn(&mut Update)) -> Vec<State> {
             let mut states = vec![self.monitor.verdict().state];
-            for _ in 0..(seconds / SCAN).round() as usize {
-                self.now = self.now.plus(SCAN);
+            for _ in 0..(seconds / self.period).round() as usize {
+                self.now = self.now.plus(self.period);
                 self.monitor.on_odometry(self.now);
                 let mut update = self.update();
                 change(&mut update);
@@ -445,7 +460,11 @@ mod tests {
         }
 
         fn localized() -> Self {
-            let mut drive = Self::new();
+            Self::localized_at(SCAN)
+        }
+
+        fn localized_at(period: f64) -> Self {
+            let mut drive = Self::at(period);
             assert_eq!(
                 drive.drive(2.0, |_| ()),
                 [State::Init, State::Converging, State::Localized]
@@ -635,7 +654,7 @@ mod tests {
     }
 
     #[test]
-    fn two_bad_scans_do_not_degrade_and_three_do() {
+    fn two_bad_scans_at_40_hz_do_not_degrade_and_three_do() {
         let mut drive = Drive::localized();
         let jump = |update: &mut Update| update.innovation = [0.5, 0.0];
         assert_eq!(drive.drive(2.0 * SCAN, jump), [State::Localized]);
@@ -646,6 +665,42 @@ mod tests {
             [State::Degraded, State::Localized],
             "half a second of good scans mends it"
         );
+    }
+
+    /// At 10 Hz, three scans of a bad metric took 0.2 s and at 40 Hz 0.05 s, since the limit was counted in scans.
+    #[test]
+    fn the_scan_rate_changes_neither_what_degrades_nor_when_a_pose_is_lost() {
+        let jump = |update: &mut Update| update.innovation = [0.5, 0.0];
+        for hertz in [10.0, 20.0, 40.0] {
+            let period = 1.0 / hertz;
+            let mut drive = Drive::localized_at(period);
+            assert_eq!(
+                drive.drive(period, jump),
+                [State::Localized],
+                "one scan at {hertz} Hz"
+            );
+            drive.drive(1.0, |_| ());
+            assert_eq!(
+                drive.drive(0.2, jump),
+                [State::Localized, State::Degraded],
+                "0.2 s at {hertz} Hz"
+            );
+            // The time from the first bad scan to DEGRADED: the limit, rounded up to whole scans.
+            let mut drive = Drive::localized_at(period);
+            let begun = drive.now.plus(period);
+            while drive.monitor.verdict().state == State::Localized {
+                drive.drive(period, jump);
+            }
+            let took = drive.now.since(begun);
+            assert!((0.04..=0.04 + period).contains(&took), "{took} s at {hertz} Hz");
+            let mut drive = Drive::localized_at(period);
+            let begun = drive.now.plus(period);
+            while drive.monitor.verdict().state != State::Lost {
+                drive.drive(period, wrong_pose);
+            }
+            let took = drive.now.since(begun);
+            assert!((0.3..=0.5).contains(&took), "lost after {took} s at {hertz} Hz");
+        }
     }
 
     #[test]

@@ -68,8 +68,8 @@ pub struct Thresholds {
     pub smoothing: f64,
     /// ...and with this one before it speaks for a wrong pose [s].
     pub smoothing_lost: f64,
-    /// A metric is bad when it was so for this many scans on end.
-    pub bad_scans: u32,
+    /// A metric degrades the state when it was bad for this long without a break [s].
+    pub bad_for: f64,
     /// Two families of evidence for this long mean lost [s].
     pub lost_after: f64,
     /// Alignment below `alignment_wrong` for this long means lost [s].
@@ -111,7 +111,7 @@ impl Default for Thresholds {
             stale_after: 0.4,
             smoothing: 0.25,
             smoothing_lost: 0.1,
-            bad_scans: 3,
+            bad_for: 0.04,
             lost_after: 0.3,
             wrong_after: 0.3,
             alone_after: 2.0,

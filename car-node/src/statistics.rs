@@ -68,6 +68,12 @@ pub fn percentile(values: &[f64], share: f64) -> Option<f64> {
     sorted.get(rank.max(1) - 1).copied()
 }
 
+/// A number for the wire, where NaN and infinities have no place: they become 0.
+pub(crate) fn finite(value: f64) -> f32 {
+    let value = value as f32;
+    if value.is_finite() { value } else { 0.0 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

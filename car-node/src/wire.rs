@@ -11,15 +11,9 @@ use synpf::{Hypothesis, Odometry, Scan, Twist};
 use crate::health::Metrics;
 use crate::sensors::TrueMotion;
 use crate::sensors::clock::SensorClock;
+pub(crate) use crate::statistics::finite;
 use crate::telemetry::counters::Spread;
 use crate::telemetry::queue::{BeamClass, CloudSample, HealthReport, PoseReport, ScanPoints};
-
-/// What is not finite has no place on the wire; such a number becomes 0, having been counted as bad where it
-/// arose.
-pub(crate) fn finite(value: f64) -> f32 {
-    let value = value as f32;
-    if value.is_finite() { value } else { 0.0 }
-}
 
 /// A share in [0, 1].
 pub(crate) fn share(value: f64) -> f32 {

@@ -7,8 +7,7 @@ use synpf::{Mode, Stamp, Update};
 use super::rules::{Evidence, Family, Finding, findings};
 use super::scan_fit::ScanFit;
 use super::{Cause, CauseKind, Metrics, Severity, State, Thresholds};
-use crate::statistics::percentile;
-use crate::wire::finite;
+use crate::statistics::{finite, percentile};
 
 /// The state, with all that led to it.
 #[derive(Debug, Clone, PartialEq)]

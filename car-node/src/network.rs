@@ -1,4 +1,4 @@
-//! The network: the only file, with its publisher and its desk, that names zenoh.
+//! The network: opens the zenoh session and declares publishers on it.
 //!
 //! The car dials the pit wall as a peer and listens to nobody. It never blocks: what a slow link cannot take is
 //! dropped, and of the streams that must be whole the pit wall asks for what it lacks (`archive.rs`). zenoh-ext's recovery

@@ -99,38 +99,38 @@ mod tests {
     use super::*;
     use crate::health::tests_support::good_update;
 
-    fn drive(advisor: &mut SetRecommender, from: f64, seconds: f64, slip: impl Fn(usize) -> f64) {
+    fn drive(recommender: &mut SetRecommender, from: f64, seconds: f64, slip: impl Fn(usize) -> f64) {
         for scan in 0..(seconds * 40.0) as usize {
             let mut update = good_update(Stamp(0).plus(from + scan as f64 / 40.0), 1);
             update.twist.linear_x = 3.0;
             update.slip = slip(scan);
-            advisor.on_update(&update, &Thresholds::default());
+            recommender.on_update(&update, &Thresholds::default());
         }
     }
 
     #[test]
     fn slipping_calls_for_lq_and_grip_for_hq() {
-        let mut advisor = SetRecommender::default();
-        drive(&mut advisor, 0.0, 2.0, |_| 0.2);
-        assert_eq!(advisor.proposal("hq"), None, "too early to tell");
-        drive(&mut advisor, 2.0, 3.0, |_| 0.2);
-        assert_eq!(advisor.proposal("hq").expect("slips").set, "lq");
-        assert_eq!(advisor.proposal("lq"), None);
-        assert_eq!(advisor.proposal("my-own"), None);
-        drive(&mut advisor, 5.0, 10.0, |_| 0.01);
-        assert_eq!(advisor.proposal("lq").expect("grips").set, "hq");
-        assert_eq!(advisor.proposal("hq"), None);
+        let mut recommender = SetRecommender::default();
+        drive(&mut recommender, 0.0, 2.0, |_| 0.2);
+        assert_eq!(recommender.proposal("hq"), None, "too early to tell");
+        drive(&mut recommender, 2.0, 3.0, |_| 0.2);
+        assert_eq!(recommender.proposal("hq").expect("slips").set, "lq");
+        assert_eq!(recommender.proposal("lq"), None);
+        assert_eq!(recommender.proposal("my-own"), None);
+        drive(&mut recommender, 5.0, 10.0, |_| 0.01);
+        assert_eq!(recommender.proposal("lq").expect("grips").set, "hq");
+        assert_eq!(recommender.proposal("hq"), None);
     }
 
     #[test]
     fn in_between_the_proposal_stays_what_it_was() {
         let tenth = |scan: usize| if scan.is_multiple_of(10) { 0.2 } else { 0.0 };
-        let mut advisor = SetRecommender::default();
-        drive(&mut advisor, 0.0, 8.0, tenth);
-        assert_eq!(advisor.proposal("hq"), None);
-        assert_eq!(advisor.proposal("lq"), None);
-        drive(&mut advisor, 8.0, 8.0, |_| 0.2);
-        drive(&mut advisor, 16.0, 20.0, tenth);
-        assert_eq!(advisor.proposal("hq").expect("still").set, "lq");
+        let mut recommender = SetRecommender::default();
+        drive(&mut recommender, 0.0, 8.0, tenth);
+        assert_eq!(recommender.proposal("hq"), None);
+        assert_eq!(recommender.proposal("lq"), None);
+        drive(&mut recommender, 8.0, 8.0, |_| 0.2);
+        drive(&mut recommender, 16.0, 20.0, tenth);
+        assert_eq!(recommender.proposal("hq").expect("still").set, "lq");
     }
 }

@@ -168,7 +168,7 @@ impl<T> Slot<T> {
 /// Records that wait for the publisher: half a second of all streams of a car at full rate.
 const QUEUE: usize = 256;
 
-/// Between the filter, the desk and the load meter on one side and the publisher on the other.
+/// A queue from the filter, the command server and the load meter to the publisher.
 #[derive(Debug)]
 pub struct TelemetryQueue {
     pose: Slot<PoseReport>,

@@ -5,6 +5,18 @@
 //!
 //! Localizers are deterministic: no clock, no file, no network, no hidden randomness. The same seed and the same log
 //! give the same bytes.
+//!
+//! ```
+//! use localizer::{Dropped, Localizer, Odometry, Scan, Update};
+//!
+//! /// Whichever localizer it is: odometry first, then the scan that was taken meanwhile.
+//! fn follow(localizer: &mut dyn Localizer, odometry: &[Odometry], scan: &Scan) -> Result<Update, Dropped> {
+//!     for message in odometry {
+//!         localizer.on_odometry(message)?;
+//!     }
+//!     localizer.on_scan(scan)
+//! }
+//! ```
 
 mod hand_over;
 mod parameters;

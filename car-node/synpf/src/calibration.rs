@@ -9,6 +9,7 @@ mod wall_calibration;
 
 use localizer::Stamp;
 use maps::{DistanceField, Pose};
+use nalgebra::{Matrix3, Vector3};
 
 pub(crate) use self::slip_model::{Drive, SlipModel};
 pub(crate) use self::slip_window::Slip;
@@ -34,6 +35,13 @@ impl Calibration {
         self.window.clear();
         self.slip = Slip::default();
         self.slip_model.forget_pose();
+    }
+
+    /// Covariance of a pose for a scan whose beams were measured over `sweep` [s] and brought to one time: half of it at the
+    /// velocity that calibrated odometry gets wrong. In the frame of `base_link`.
+    pub(crate) fn sweep_error(&self, sweep: f64) -> Matrix3<f64> {
+        let sigma = Vector3::from(self.slip.unforeseen) * (0.5 * sweep);
+        Matrix3::from_diagonal(&sigma.component_mul(&sigma))
     }
 
     /// The car's own speed over the last moments [m/s]; zero before it is known.

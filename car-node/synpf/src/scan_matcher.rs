@@ -71,7 +71,17 @@ struct Normal {
     gradient: Vector3<f64>,
 }
 
-/// Fits the end points to the field around `prior`, starting from `start`.
+/// The fit of a scan.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ScanMatch {
+    /// The pose, with the covariance of a filter that trusts end points by `refine_sigma`: what the next fit goes by.
+    pub(crate) estimate: Estimate,
+    /// Covariance of the pose with end points that scatter as they were seen to. `refine_sigma` leaves room for what a map
+    /// has wrong, which most of it has not: the fit then errs by less than the filter allows for.
+    pub(crate) covariance: Matrix3<f64>,
+}
+
+/// [`match_scan`] for where the filter's covariance is enough.
 pub(crate) fn refine(
     field: &DistanceField,
     points: &[[f32; 2]],
@@ -80,6 +90,18 @@ pub(crate) fn refine(
     walls: WallCalibration,
     parameters: &RefinementParameters,
 ) -> Estimate {
+    match_scan(field, points, start, prior, walls, parameters).estimate
+}
+
+/// Fits the end points to the field around `prior`, starting from `start`.
+pub(crate) fn match_scan(
+    field: &DistanceField,
+    points: &[[f32; 2]],
+    start: Pose,
+    prior: &Estimate,
+    walls: WallCalibration,
+    parameters: &RefinementParameters,
+) -> ScanMatch {
     let stride = points.len().div_ceil(parameters.refine_beams).max(1);
     let sigma = parameters.refine_sigma.max(walls.scatter);
     let weight = 1.0 / (sigma.powi(2) * (parameters.refine_correlation / stride as f64).max(1.0));
@@ -114,9 +136,17 @@ pub(crate) fn refine(
         }
         reach = (reach * 0.5).max(least_reach);
     }
-    Estimate {
-        pose,
-        covariance: regular_inverse(&information),
+    let covariance = regular_inverse(&information);
+    // The covariance of an update whose gain supposes more noise than there is (Joseph's form, in information).
+    let share = if walls.scatter > 0.0 {
+        (walls.scatter / sigma).powi(2)
+    } else {
+        1.0
+    };
+    let seen = prior_information + (information - prior_information) * share;
+    ScanMatch {
+        estimate: Estimate { pose, covariance },
+        covariance: covariance * seen * covariance,
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! [`SynPf::on_scan`] is the algorithm; each step of it is a function below it.
 
-mod stages;
+pub(crate) mod stages;
 
 use std::sync::Arc;
 
@@ -13,11 +13,9 @@ use localizer::{
 use maps::{Pose, wrap_angle};
 use nalgebra::{Matrix3, Vector3};
 
-#[doc(hidden)]
-pub use self::stages::Stage;
 use crate::calibration::{Calibration, SlipModel};
 use crate::error::SetUpError;
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, rotation};
 use crate::motion_model::Motion;
 use crate::odometry_track::{CARRY, OdometryTrack};
 use crate::parameters::Parameters;
@@ -56,6 +54,8 @@ struct Step {
     stamp: Stamp,
     /// Time since the estimate [s].
     seconds: f64,
+    /// Time from the first beam to the last [s].
+    sweep: f64,
     /// Calibrated odometry's pose at the stamp.
     odom: Pose,
     twist: Twist,
@@ -75,6 +75,9 @@ const PAUSE: f64 = 0.5;
 
 /// By how much the noise is wider after such a pause.
 const AFTER_PAUSE: f64 = 2.0;
+
+/// Slip is taken to go on as it was for so long after a scan [s].
+const AHEAD: f64 = 0.1;
 
 /// Least standard deviations of the particles around a pose that a search has found [m], [m], [rad].
 const FOUND_SPREAD: [f64; 3] = [0.1, 0.1, 0.05];
@@ -154,6 +157,7 @@ impl SynPf {
         Ok(Step {
             stamp: scan.stamp,
             seconds: seconds.abs(),
+            sweep: scan.time_increment * scan.ranges.len() as f64,
             odom,
             twist,
             motion: odom.since(odom_before),
@@ -204,7 +208,7 @@ impl SynPf {
     fn fit(&mut self, step: &Step, predicted: &Estimate, weighted: Option<&Weighted>) -> Option<Pose> {
         self.tracker.at = Some((step.stamp, step.odom));
         let Some(weighted) = weighted else {
-            self.tracker.estimate = *predicted;
+            self.tracker.set(*predicted);
             return None;
         };
         let Self {
@@ -224,6 +228,9 @@ impl SynPf {
         );
         let estimate = fit.estimate;
         self.tracker.estimate = estimate;
+        let turn = rotation(estimate.pose.heading);
+        self.tracker.covariance =
+            fit.covariance + turn * calibration.sweep_error(step.sweep) * turn.transpose();
 
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
@@ -279,7 +286,7 @@ impl SynPf {
                 self.mode = Mode::Searching;
                 self.calibration.forget_pose();
                 match best {
-                    Some(best) => self.tracker.estimate = best,
+                    Some(best) => self.tracker.set(best),
                     None => self.tracker.forget(&self.map),
                 }
             }
@@ -310,7 +317,7 @@ impl SynPf {
         quality: &Quality,
     ) -> Update {
         self.number += 1;
-        let estimate = self.tracker.estimate.transformed(self.map.grid().origin);
+        let estimate = self.tracker.posterior().transformed(self.map.grid().origin);
         let (mut spread, mut ess_ratio, mut second_mode) = ([0.0; 2], 1.0, 0.0);
         let mut innovation = Pose::IDENTITY;
         if let Some(Weighted { particles, .. }) = weighted {
@@ -382,7 +389,7 @@ impl SynPf {
     /// Follows an estimate from now on, with particles drawn from `cloud`.
     fn start(&mut self, estimate: Estimate, cloud: &Estimate) {
         self.mode = Mode::Tracking;
-        self.tracker.estimate = estimate;
+        self.tracker.set(estimate);
         self.filter
             .scatter(self.parameters.particles.max_particles, cloud);
         self.recovery.follow();
@@ -484,9 +491,17 @@ impl Localizer for SynPf {
     }
 
     fn predict(&self, stamp: Stamp) -> Option<Pose> {
-        let (_, odom_then) = self.tracker.at?;
+        let (then, odom_then) = self.tracker.at?;
         let (odom, _) = self.odometry.at(stamp, CARRY)?;
-        Some(self.map.grid().origin * self.tracker.estimate.pose * odom.since(odom_then))
+        let motion = odom.since(odom_then);
+        // What odometry got wrong just now it still gets wrong for a moment.
+        let seconds = stamp.since(then);
+        let motion = if (0.0..AHEAD).contains(&seconds) {
+            self.calibration.slip.corrected(motion, seconds)
+        } else {
+            motion
+        };
+        Some(self.map.grid().origin * self.tracker.estimate.pose * motion)
     }
 
     fn particles(&self, most: usize) -> Vec<WeightedPose> {
@@ -508,7 +523,7 @@ impl Localizer for SynPf {
     }
 
     fn hand_over(&self) -> HandOver {
-        let estimate = self.tracker.estimate.transformed(self.map.grid().origin);
+        let estimate = self.tracker.posterior().transformed(self.map.grid().origin);
         let following = self.tracker.at.filter(|_| self.mode == Mode::Tracking);
         HandOver {
             estimate: following.map(|(stamp, _)| HandedEstimate {

@@ -347,6 +347,50 @@ fn what_is_missing_is_said() {
 }
 
 #[test]
+fn the_first_scan_after_an_initial_pose_counts() {
+    // Scans arrive later than odometry: the pose is true at an odometry that is newer than the next scan.
+    let map = ring();
+    let mut localizer = localizer(&map, named("hq"), 9);
+    for step in 0..5 {
+        localizer
+            .on_odometry(&odometry(0.02 * f64::from(step), 1.0))
+            .expect("sound");
+    }
+    localizer.initialize(truth(0.08)).expect("finite");
+    let update = localizer.on_scan(&scan(&map, 0.06)).expect("an update");
+    assert!(error(&update) < 0.05, "{}", error(&update));
+}
+
+#[test]
+fn a_search_publishes_what_is_known_with_a_covariance_as_large_as_the_doubt() {
+    let map = ring();
+    let mut blind = scan(&map, 0.0);
+    blind.ranges.fill(0.5);
+    let searched = |localizer: &mut SynPf| {
+        localizer.relocalize();
+        let mut scan = blind.clone();
+        scan.stamp = common::stamp(1.0);
+        localizer.on_odometry(&odometry(1.0, 1.0)).expect("sound");
+        let update = localizer.on_scan(&scan).expect("an update");
+        assert_eq!(update.mode, Mode::Searching);
+        update
+    };
+    // Somewhere on the ring, which is 14 m across: it used to be the map's corner without any doubt.
+    let mut nobody_placed = localizer(&map, named("hq"), 10);
+    nobody_placed.on_odometry(&odometry(0.98, 1.0)).expect("sound");
+    let update = searched(&mut nobody_placed);
+    assert!(update.pose.x.hypot(update.pose.y) < 9.0, "{:?}", update.pose);
+    let sigma = (update.covariance[(0, 0)] + update.covariance[(1, 1)]).sqrt();
+    assert!(sigma > 1.0, "{sigma}");
+    assert!(update.covariance[(2, 2)].sqrt() > 0.4);
+
+    let mut carried = driven(&map, 10);
+    let update = searched(&mut carried);
+    let sigma = (update.covariance[(0, 0)] + update.covariance[(1, 1)]).sqrt();
+    assert!(sigma > 1.0, "{sigma}");
+}
+
+#[test]
 fn a_map_without_room_is_refused() {
     let walls = maps::OccupancyGrid::new(20, 20, 0.05, Pose::IDENTITY, vec![maps::Cell::Occupied; 400]);
     let message = TrackMap::new(walls).expect_err("no room").to_string();

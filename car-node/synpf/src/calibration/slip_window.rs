@@ -20,6 +20,11 @@ struct Step {
     /// The same, less the slip that was expected [m], and the turn [rad].
     odometry: [f64; 2],
     posterior: [f64; 2],
+    /// Motion to the left by the posterior less that by odometry [m].
+    aside: f64,
+    /// By how much odometry was off, corrected as the steps before had taught: forwards and to the left [m/s], turning
+    /// [rad/s].
+    unforeseen: [f64; 3],
 }
 
 /// Slip over the window.
@@ -34,8 +39,13 @@ pub(crate) struct Slip {
     /// The share of odometry's turn by which it errs: a yaw rate told from the steering is off by more the faster the car
     /// turns, and changes its sign with the bend.
     turn_share: f64,
-    /// What of `yaw_rate` that does not explain [rad/s].
+    /// What of odometry's yaw rate that does not explain, of late [rad/s].
     turn_rest: f64,
+    /// Velocity to the left that odometry does not see, of late [m/s].
+    side_speed: f64,
+    /// Standard deviations of what is left when odometry is corrected by all this: forwards and to the left [m/s], turning
+    /// [rad/s].
+    pub(crate) unforeseen: [f64; 3],
 }
 
 impl Slip {
@@ -47,7 +57,7 @@ impl Slip {
         let (share, rest) = (self.turn_share.clamp(-1.0, 1.0), self.turn_rest.clamp(-2.0, 2.0));
         Pose::new(
             motion.x * (1.0 - ratio),
-            motion.y * (1.0 - ratio),
+            motion.y * (1.0 - ratio) + self.side_speed.clamp(-2.0, 2.0) * seconds,
             motion.heading * (1.0 - share) - rest * seconds,
         )
     }
@@ -55,6 +65,9 @@ impl Slip {
 
 /// Length of the window [s].
 const WINDOW: f64 = 0.3;
+
+/// Yaw rate and sideslip change within tenths of a second: what corrects a sweep must be as fresh as this [s].
+const RECENT: f64 = 0.04;
 
 /// A yaw rate of which its error is hardly a share [rad/s].
 const HARDLY: f64 = 0.5;
@@ -73,12 +86,16 @@ impl SlipWindow {
         odometry: Pose,
         posterior: Pose,
     ) {
+        let foreseen = self.slip().corrected(odometry, seconds);
+        let off = posterior.since(foreseen);
         self.steps.push_back(Step {
             stamp,
             seconds,
             wheel_distance,
             odometry: [odometry.x, odometry.heading],
             posterior: [posterior.x, posterior.heading],
+            aside: posterior.y - odometry.y,
+            unforeseen: [off.x, off.y, maps::wrap_angle(off.heading)].map(|v| v / seconds),
         });
         while self
             .steps
@@ -110,12 +127,29 @@ impl SlipWindow {
         // Least squares, shrunk by what a car that hardly turns could tell.
         let turn_share = sum(|step| step.odometry[1] * (step.odometry[1] - step.posterior[1]))
             / sum(|step| step.odometry[1].powi(2) + (HARDLY * step.seconds).powi(2)).max(1e-12);
+        let recent = || {
+            let latest = self.steps.back().map(|step| step.stamp);
+            let fresh = move |step: &&Step| latest.is_some_and(|latest| latest.since(step.stamp) < RECENT);
+            self.steps.iter().filter(fresh)
+        };
+        let recent_seconds = recent().map(|step| step.seconds).sum::<f64>().max(1e-9);
+        let off_turn = |step: &Step| (1.0 - turn_share) * step.odometry[1] - step.posterior[1];
+        let unforeseen = [0, 1, 2].map(|i| {
+            let squares = self
+                .steps
+                .iter()
+                .map(|step| step.unforeseen[i].powi(2))
+                .sum::<f64>();
+            (squares / self.steps.len() as f64).sqrt()
+        });
         Slip {
             ratio: share(driven),
             unexplained: share(sum(|step| step.odometry[0])),
             yaw_rate,
             turn_share,
-            turn_rest: yaw_rate - turn_share * turn / seconds,
+            turn_rest: recent().map(off_turn).sum::<f64>() / recent_seconds,
+            side_speed: recent().map(|step| step.aside).sum::<f64>() / recent_seconds,
+            unforeseen,
         }
     }
 

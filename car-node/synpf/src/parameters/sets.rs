@@ -21,9 +21,9 @@ fn lq() -> Parameters {
     let hq = Parameters::default();
     Parameters {
         motion: MotionParameters {
-            odometry_speed_error: 0.2,
-            odometry_side_error: 0.25,
-            odometry_yaw_error: 1.0,
+            odometry_speed_error: 0.3,
+            odometry_side_error: 0.375,
+            odometry_yaw_error: 1.5,
             diffusion_heading: 0.3,
             ..hq.motion
         },

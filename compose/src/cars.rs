@@ -13,7 +13,7 @@ use synpf::{TablePolicy, TrackMap};
 
 use crate::Options;
 
-/// From one car to the next on the grid [m]: near enough for the one behind to have the other in view.
+/// From one car to the next on the grid \[m\]: near enough for the one behind to have the other in view.
 const GAP: f64 = 4.0;
 
 /// What happens repeats after this long.

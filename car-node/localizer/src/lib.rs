@@ -24,6 +24,7 @@ mod sensors;
 mod stamp;
 mod update;
 
+use std::any::Any;
 use std::fmt;
 
 use maps::Pose;
@@ -32,7 +33,7 @@ pub use hand_over::{HandOver, HandedEstimate};
 pub use parameters::{ParameterFault, ParameterValues, PreparedParameters, overlay, to_values};
 pub use sensors::{Odometry, Scan, Twist, YawRate};
 pub use stamp::Stamp;
-pub use update::{Dropped, Hypothesis, Mode, Update, WeightedPose};
+pub use update::{Doubt, Dropped, Hypothesis, Mode, Update, WeightedPose};
 
 /// Why a pose cannot be started from.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -44,6 +45,12 @@ pub enum PoseError {
     #[error("pose ({:.2}, {:.2}) is off the map", .0.x, .0.y)]
     OffMap(Pose),
 }
+
+/// Work that takes longer than an update, to be run on another thread.
+pub type Job = Box<dyn FnOnce() -> JobOutcome + Send>;
+
+/// What a [`Job`] came to, for the localizer that it is from.
+pub type JobOutcome = Box<dyn Any + Send>;
 
 /// Sensors in, poses out. One thread owns a localizer.
 ///
@@ -73,6 +80,15 @@ pub trait Localizer: fmt::Debug + Send {
 
     /// What a search under way has found, best first; empty when none is.
     fn hypotheses(&self) -> Vec<Hypothesis>;
+
+    /// Work that the latest scan has asked for. Whoever takes it runs it on another thread and hands the outcome in with
+    /// [`Localizer::finish_job`]; the localizer goes on meanwhile. What nobody takes is done within the next scan.
+    fn take_job(&mut self) -> Option<Job> {
+        None
+    }
+
+    /// Takes in what a job came to. An outcome that is no longer asked for is ignored.
+    fn finish_job(&mut self, _outcome: JobOutcome) {}
 
     /// The parameter set in force.
     fn parameters(&self) -> ParameterValues;

@@ -101,6 +101,17 @@ pub struct Update {
     pub slip: f64,
     /// Odometry's yaw rate less the posterior's, over the last 0.3 s [rad/s].
     pub yaw_rate_residual: f64,
+    /// Why the pose may be wrong; None while nothing speaks against it.
+    pub doubt: Option<Doubt>,
+}
+
+/// A pose in doubt: a rival pose explains the scans as well or better, or the car seems to have been carried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Doubt {
+    /// Probability that the pose is wrong, in [0, 1].
+    pub probability: f64,
+    /// The rival, `map_from_base_link`; None before one is found.
+    pub rival: Option<Pose>,
 }
 
 /// A pose that a search of the whole map has found, for the operator to choose from.

@@ -63,6 +63,7 @@ pub(crate) mod tests_support {
             innovation: [0.01, 0.01],
             slip: 0.0,
             yaw_rate_residual: 0.0,
+            doubt: None,
         }
     }
 }

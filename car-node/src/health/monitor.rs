@@ -148,6 +148,7 @@ impl Monitor {
             metrics: &metrics,
             slow,
             fast,
+            doubt: update.doubt,
             good: self.verdict.state == State::Localized,
         };
         self.findings = findings(&evidence, &self.thresholds);
@@ -315,12 +316,13 @@ impl Monitor {
 
     /// True for a finding that has lasted long enough to degrade the state.
     fn lasting(&self, finding: &Finding) -> bool {
-        finding.degrades
-            && self
-                .found_since
+        let lasted = || {
+            self.found_since
                 .get(&finding.kind)
                 .zip(self.last_update)
                 .is_some_and(|(since, last)| last.since(*since) >= self.thresholds.bad_for)
+        };
+        finding.degrades && (finding.at_once || lasted())
     }
 
     /// Which sensors are silent, with the time since they last spoke [s].
@@ -400,6 +402,7 @@ impl Monitor {
 mod tests {
     use super::*;
     use crate::health::tests_support::good_update;
+    use localizer::Doubt;
     use maps::Pose;
     use synpf::Twist;
 
@@ -506,6 +509,31 @@ mod tests {
         assert!(drive.kinds().contains(&CauseKind::LongBeams));
         let states = drive.drive(3.0, |_| ());
         assert_eq!(states, [State::Lost, State::Converging, State::Localized]);
+    }
+
+    #[test]
+    fn a_pose_in_doubt_is_degraded_with_the_first_scan_and_not_lost() {
+        let doubt = |rival| {
+            move |update: &mut Update| {
+                update.doubt = Some(Doubt {
+                    probability: 0.4,
+                    rival,
+                });
+            }
+        };
+        for (rival, kind) in [
+            (Some(Pose::new(3.0, 0.0, 0.0)), CauseKind::SecondMode),
+            (None, CauseKind::Likelihood),
+        ] {
+            let mut drive = Drive::localized();
+            assert_eq!(
+                drive.drive(SCAN, doubt(rival)),
+                [State::Localized, State::Degraded]
+            );
+            assert_eq!(drive.kinds(), [kind]);
+            assert_eq!(drive.drive(3.0, doubt(rival)), [State::Degraded]);
+            assert_eq!(drive.drive(1.0, |_| ()), [State::Degraded, State::Localized]);
+        }
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! The table of metrics against their thresholds: which are bad, and what they speak for.
 
+use localizer::Doubt;
+
 use super::scan_fit::ScanFit;
 use super::{CauseKind, Metrics, Severity, Thresholds};
 
@@ -28,6 +30,8 @@ pub(super) struct Finding {
     pub(super) limit: f64,
     /// Whether it makes the state DEGRADED when it lasts.
     pub(super) degrades: bool,
+    /// Whether it does so with a single scan.
+    pub(super) at_once: bool,
     /// What it speaks for when it says that the pose is wrong.
     pub(super) lost: Option<Family>,
 }
@@ -56,6 +60,7 @@ fn degraded(kind: CauseKind, bad: Bad, value: f64, limit: f64) -> Option<Finding
         value,
         limit,
         degrades: true,
+        at_once: false,
         lost: None,
     })
 }
@@ -68,6 +73,7 @@ fn lost(kind: CauseKind, bad: Bad, value: f64, limit: f64, family: Family) -> Op
         value,
         limit,
         degrades: true,
+        at_once: false,
         lost: Some(family),
     })
 }
@@ -80,6 +86,7 @@ fn hint(kind: CauseKind, severity: Severity, value: f64, limit: f64) -> Option<F
         value,
         limit,
         degrades: false,
+        at_once: false,
         lost: None,
     })
 }
@@ -93,6 +100,8 @@ pub(super) struct Evidence<'a> {
     pub(super) slow: ScanFit,
     /// The fit over the last tenth of a second: a wrong pose shows soon.
     pub(super) fast: ScanFit,
+    /// What speaks against the pose by the localizer's own account.
+    pub(super) doubt: Option<Doubt>,
     /// The state is good now, so that a limit is only crossed where it says; else all must be better than that.
     pub(super) good: bool,
 }
@@ -104,6 +113,7 @@ pub(super) fn findings(evidence: &Evidence<'_>, t: &Thresholds) -> Vec<Finding> 
     fit.into_iter()
         .chain([long_beams(evidence, off_walls, t)])
         .chain(pose(evidence.metrics, t))
+        .chain([evidence.doubt.map(in_doubt)])
         .chain(hints(evidence, t))
         .flatten()
         .collect()
@@ -167,6 +177,23 @@ fn pose(metrics: &Metrics, t: &Thresholds) -> [Option<Finding>; 5] {
     ]
 }
 
+/// The localizer doubts its pose: another place explains the scans as well, or the scan does not go on from the one before.
+fn in_doubt(doubt: Doubt) -> Finding {
+    Finding {
+        kind: if doubt.rival.is_some() {
+            CauseKind::SecondMode
+        } else {
+            CauseKind::Likelihood
+        },
+        severity: Severity::Warning,
+        value: doubt.probability,
+        limit: 0.0,
+        degrades: true,
+        at_once: true,
+        lost: None,
+    }
+}
+
 fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
     use CauseKind::{EffectiveSampleSize, Likelihood, NoReturn, Occluded, Slip, YawRate};
     let m = evidence.metrics;
@@ -177,6 +204,7 @@ fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
             value,
             limit,
             degrades: false,
+            at_once: false,
             lost: None,
         })
     };

@@ -54,10 +54,11 @@ mod beam_layout;
 mod beam_model;
 mod calibration;
 mod cddt;
+mod correlative_match;
 mod error;
 mod estimate;
+mod global_search;
 mod likelihood_field;
-mod loss_detector;
 mod motion_model;
 mod normal_pool;
 mod odometry_track;
@@ -76,11 +77,8 @@ mod reference;
 mod regions;
 mod resampling;
 mod scan_matcher;
-mod search;
-mod seed;
 mod sensor_model;
 mod sensor_parameters;
-mod surprise;
 mod synpf;
 mod table_store;
 mod track_map;
@@ -90,19 +88,20 @@ mod validation;
 
 pub use beam_layout::{BeamLayout, BeamParameters};
 pub use error::SetUpError;
+pub use global_search::{GlobalCheck, GlobalCheckOutcome, SearchParameters};
 pub use localizer::{
-    Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
-    ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose, YawRate,
+    Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
+    ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose,
+    YawRate,
 };
-pub use loss_detector::RecoveryParameters;
 pub use motion_model::{MotionModel, MotionParameters};
 pub use parameters::{Parameters, parameter_table};
 pub use particles::ParticleParameters;
+pub use recovery::RecoveryParameters;
 pub use reference::{
     Reference, ReferenceDefects, ReferenceMotionModel, ReferenceParameters, ReferenceTuning,
 };
 pub use scan_matcher::RefinementParameters;
-pub use search::SearchParameters;
 pub use sensor_parameters::{RangeMethod, SensorModelKind, SensorParameters};
 pub use synpf::SynPf;
 #[doc(hidden)]

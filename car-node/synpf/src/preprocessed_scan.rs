@@ -181,6 +181,15 @@ impl PreprocessedScan {
         }
     }
 
+    /// A scan with the same end points, and nothing else.
+    pub(crate) fn end_points(&self) -> Self {
+        Self {
+            points: self.points.clone(),
+            base_link_from_laser: self.base_link_from_laser,
+            ..Self::default()
+        }
+    }
+
     /// End points of the beams to weigh that have a return.
     pub(crate) fn weighed_points(&self) -> impl Iterator<Item = [f32; 2]> + '_ {
         let points = self.chosen.iter().map(|&beam| self.point_of[beam as usize]);

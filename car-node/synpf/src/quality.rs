@@ -101,7 +101,7 @@ impl Quality {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::search::fit_of;
+    use crate::recovery::scan_likelihood::fit_of;
     use maps::{Cell, OccupancyGrid};
 
     /// A room of 10 x 6 m in cells of 5 cm, with a door 2 m wide in its right wall. Nothing was mapped around it.

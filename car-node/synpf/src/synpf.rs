@@ -7,8 +7,9 @@ pub(crate) mod stages;
 use std::sync::Arc;
 
 use localizer::{
-    Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
-    ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose, YawRate,
+    Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
+    ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose,
+    YawRate,
 };
 use maps::{Pose, wrap_angle};
 use nalgebra::{Matrix3, Vector3};
@@ -16,14 +17,15 @@ use nalgebra::{Matrix3, Vector3};
 use crate::calibration::{Calibration, SlipModel};
 use crate::error::SetUpError;
 use crate::estimate::{Estimate, rotation};
+use crate::global_search::{GlobalCheck, GlobalCheckOutcome, SearchSettings};
 use crate::motion_model::Motion;
 use crate::odometry_track::{CARRY, OdometryTrack};
 use crate::parameters::Parameters;
 use crate::particle_filter::{ParticleFilter, Weighted};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
+use crate::recovery::scan_likelihood::INDEPENDENT;
 use crate::recovery::{Decision, Evidence, Recovery};
-use crate::search::{INDEPENDENT, SearchSettings};
 use crate::track_map::TrackMap;
 use crate::tracker::{Tracker, Uncertainty, fit_scan};
 use crate::tuning::Tuning;
@@ -268,6 +270,7 @@ impl SynPf {
             motion: step.motion,
             displaced: step.displaced,
             seconds: step.seconds,
+            scatter: self.calibration.walls.scatter,
         });
         match decision {
             Decision::Keep => return quality,
@@ -281,6 +284,7 @@ impl SynPf {
                         ..estimate
                     },
                 );
+                self.recovery.follow_found();
             }
             Decision::Searching(best) => {
                 self.mode = Mode::Searching;
@@ -317,7 +321,12 @@ impl SynPf {
         quality: &Quality,
     ) -> Update {
         self.number += 1;
-        let estimate = self.tracker.posterior().transformed(self.map.grid().origin);
+        let (map_from_grid, doubt) = (self.map.grid().origin, self.recovery.doubt());
+        let mut estimate = self.tracker.posterior();
+        if let Some(doubt) = doubt {
+            estimate.covariance = doubt.widened(&estimate);
+        }
+        let estimate = estimate.transformed(map_from_grid);
         let (mut spread, mut ess_ratio, mut second_mode) = ([0.0; 2], 1.0, 0.0);
         let mut innovation = Pose::IDENTITY;
         if let Some(Weighted { particles, .. }) = weighted {
@@ -355,6 +364,10 @@ impl SynPf {
             odometry_jump: step.odometry_jump,
             slip: self.calibration.slip.ratio,
             yaw_rate_residual: self.calibration.slip.yaw_rate,
+            doubt: doubt.map(|doubt| Doubt {
+                probability: doubt.probability,
+                rival: doubt.rival.map(|pose| map_from_grid * pose),
+            }),
         }
     }
 
@@ -415,6 +428,19 @@ impl SynPf {
                 fit: (candidate.score / INDEPENDENT).exp(),
             })
             .collect()
+    }
+
+    /// The look at the whole map that the latest scan has asked for; None when none is wanted. It takes as long as many
+    /// updates: a caller with a thread to spare runs it there and hands the outcome in with [`SynPf::finish_global_check`].
+    /// The next scan does what nobody has taken.
+    pub fn take_global_check(&mut self) -> Option<GlobalCheck> {
+        self.recovery.take_check(&self.map)
+    }
+
+    /// Takes in what a look at the whole map has found. The odometry since is applied to it. An outcome that is no longer asked
+    /// for is ignored.
+    pub fn finish_global_check(&mut self, outcome: GlobalCheckOutcome) {
+        self.recovery.finish_check(outcome);
     }
 
     /// Swaps the parameter set between two updates; the particles stay. On `Err` nothing has changed. Builds the
@@ -511,6 +537,17 @@ impl Localizer for SynPf {
 
     fn hypotheses(&self) -> Vec<Hypothesis> {
         Self::hypotheses(self)
+    }
+
+    fn take_job(&mut self) -> Option<Job> {
+        let check = self.take_global_check()?;
+        Some(Box::new(move || Box::new(check.run())))
+    }
+
+    fn finish_job(&mut self, outcome: JobOutcome) {
+        if let Ok(outcome) = outcome.downcast() {
+            self.finish_global_check(*outcome);
+        }
     }
 
     fn parameters(&self) -> ParameterValues {

@@ -5,11 +5,11 @@ use std::sync::{Arc, OnceLock};
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
+use crate::correlative_match::ScorePyramid;
 use crate::error::SetUpError;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::reference::RangeTables;
 use crate::regions::{NOWHERE, Region, regions};
-use crate::seed::Blurred;
 use crate::table_store::{Table, TableJob, TableKey, TablePolicy, TableStore};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,
@@ -26,7 +26,7 @@ pub struct TrackMap {
     /// For each cell the index of its region; [`NOWHERE`] where it is not free.
     region_of: Vec<u16>,
     tables: TableStore,
-    blurred: OnceLock<Blurred>,
+    score_pyramid: OnceLock<ScorePyramid>,
     reference_tables: RangeTables,
 }
 
@@ -59,7 +59,7 @@ impl TrackMap {
             regions,
             region_of,
             tables: TableStore::default(),
-            blurred: OnceLock::new(),
+            score_pyramid: OnceLock::new(),
             reference_tables: RangeTables::default(),
         })
     }
@@ -174,8 +174,9 @@ impl TrackMap {
         inside(at.x, self.grid.width) && inside(at.y, self.grid.height)
     }
 
-    pub(crate) fn blurred(&self) -> &Blurred {
-        self.blurred.get_or_init(|| Blurred::new(&self.grid, &self.field))
+    pub(crate) fn score_pyramid(&self) -> &ScorePyramid {
+        self.score_pyramid
+            .get_or_init(|| ScorePyramid::new(&self.grid, &self.field))
     }
 
     /// Whether a beam from a laser ends where nothing was mapped, without having met a wall on its way: through an open door,

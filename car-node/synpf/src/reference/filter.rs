@@ -406,6 +406,7 @@ impl Reference {
             odometry_jump: None,
             slip: 0.0,
             yaw_rate_residual: 0.0,
+            doubt: None,
         }
     }
 }

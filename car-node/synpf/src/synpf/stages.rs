@@ -4,10 +4,10 @@ use localizer::Scan;
 use maps::Pose;
 
 use super::SynPf;
+use crate::correlative_match::seed;
 use crate::motion_model::Motion;
 use crate::particle_estimate::ParticleEstimate;
 use crate::particle_filter::Weighted;
-use crate::seed::seed;
 use crate::tracker::fit_scan;
 
 /// A step of [`SynPf::on_scan`].

@@ -12,12 +12,12 @@ use maps::{DistanceField, OccupancyGrid, Pose, wrap_angle};
 use rayon::prelude::*;
 
 use crate::TrackMap;
-use crate::search::SearchParameters;
+use crate::global_search::SearchParameters;
 
 /// How near a wall is, coarsely and in few bytes, so that a whole map stays in a processor's cache while every
 /// pose is tried on it.
 #[derive(Debug)]
-pub(crate) struct Blurred {
+pub(crate) struct ScorePyramid {
     fine: Level,
     coarse: Level,
 }
@@ -53,7 +53,7 @@ const CLEARANCE: f32 = 0.12;
 /// Seeds nearer to each other than this are one [m], [rad].
 const NEIGHBOURHOOD: [f64; 2] = [0.45, 0.3];
 
-impl Blurred {
+impl ScorePyramid {
     pub(crate) fn new(grid: &OccupancyGrid, field: &DistanceField) -> Self {
         let [fine, coarse] = CELL.map(|cell| Level::new(grid, field, cell));
         Self { fine, coarse }
@@ -188,7 +188,7 @@ pub(crate) fn seed(map: &TrackMap, points: &[[f32; 2]], parameters: &SearchParam
     if points.is_empty() {
         return Vec::new();
     }
-    let blurred = map.blurred();
+    let pyramid = map.score_pyramid();
     let (blocks, positions) = blocks(map, parameters.search_step);
     let stride = points.len().div_ceil(BEAMS).max(1);
     // Spread over the field of view in both halves, so that a look at the first half tells.
@@ -202,14 +202,14 @@ pub(crate) fn seed(map: &TrackMap, points: &[[f32; 2]], parameters: &SearchParam
     let pairs = (0.5 * TAU / parameters.search_turn).ceil() as usize;
     let turn = 0.5 * TAU / pairs as f64;
     let heading = |k: usize| turn * k as f64;
-    let coarsely = blurred
+    let coarsely = pyramid
         .coarse
         .turned(&points, (0..pairs).map(|pair| heading(2 * pair) + 0.5 * turn));
     let mut coarse: Vec<(u32, (usize, usize))> = coarsely
         .par_iter()
         .enumerate()
         .flat_map_iter(|(pair, points)| {
-            let matched = |block: usize| blurred.coarse.matched(blocks[block].centre, points);
+            let matched = |block: usize| pyramid.coarse.matched(blocks[block].centre, points);
             let matches: Vec<_> = (0..blocks.len())
                 .filter_map(|block| Some((matched(block)?, (block, pair))))
                 .collect();
@@ -218,7 +218,7 @@ pub(crate) fn seed(map: &TrackMap, points: &[[f32; 2]], parameters: &SearchParam
         .collect();
     best(&mut coarse, COARSE);
 
-    let finely = blurred.fine.turned(&points, (0..2 * pairs).map(heading));
+    let finely = pyramid.fine.turned(&points, (0..2 * pairs).map(heading));
     let mut fine: Vec<(u32, Pose)> = coarse
         .into_par_iter()
         .flat_map_iter(|(_, (block, pair))| {
@@ -227,7 +227,7 @@ pub(crate) fn seed(map: &TrackMap, points: &[[f32; 2]], parameters: &SearchParam
                 .into_iter()
                 .flat_map(move |k| positions.iter().map(move |&position| (k, position)))
                 .filter_map(|(k, position)| {
-                    let matched = blurred.fine.matched(position, &finely[k])?;
+                    let matched = pyramid.fine.matched(position, &finely[k])?;
                     let [x, y] = position.map(f64::from);
                     Some((matched, Pose::new(x, y, heading(k))))
                 })

@@ -68,6 +68,15 @@ pub(crate) struct SearchSettings {
     pub(crate) refinement: RefinementParameters,
 }
 
+impl SearchSettings {
+    /// The same, with candidates fitted to part of a scan.
+    pub(crate) fn with_fewer_beams(&self) -> Self {
+        let mut settings = self.clone();
+        settings.refinement.refine_beams = settings.refinement.refine_beams.min(FITTED_BEAMS);
+        settings
+    }
+}
+
 /// A pose that the car may be at.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Candidate {
@@ -112,6 +121,11 @@ impl Candidate {
             scans,
             seconds,
         }
+    }
+
+    /// How well the end points of the last scans lie on walls, in [0, 1].
+    pub(crate) fn fit(&self) -> f64 {
+        (self.score / INDEPENDENT).exp()
     }
 
     /// All that speaks for it.
@@ -170,6 +184,9 @@ pub(crate) struct Search {
     driven: f64,
     /// Time since the last global check joined [s].
     since_check: f64,
+    /// Fit below which no candidate is confirmed, and for how long the search goes on [s]: it is let go in time.
+    least_fit: f64,
+    seconds: f64,
 }
 
 /// How often new candidates join while none is confirmed [s]: soon if none explains the scan, else seldom.
@@ -187,6 +204,9 @@ const FITTED_BEAMS: usize = 180;
 /// A candidate is confirmed after so many scans, and so long [s].
 const CONFIRMED_AFTER: (u32, f64) = (3, 0.12);
 
+/// Time over which a search lets go of the fit that it asks for [s].
+const LEAST_FIT_FOR: f64 = 5.0;
+
 /// Standard deviation of a candidate that motion has not confirmed [m], [m], [rad]: it may be another place.
 const UNCONFIRMED: [f64; 3] = [1.0, 1.0, 0.5];
 
@@ -196,17 +216,27 @@ impl Default for Search {
             candidates: Vec::new(),
             driven: 0.0,
             since_check: f64::INFINITY,
+            least_fit: 0.0,
+            seconds: 0.0,
         }
     }
 }
 
 impl Search {
-    /// A search that begins with candidates which were followed over so much driving [m].
-    pub(crate) fn with(candidates: Vec<Candidate>, driven: f64, settings: &SearchSettings) -> Self {
+    /// A search that begins with candidates which were followed over so much driving [m], and that confirms none which fits
+    /// worse than `least_fit` at first.
+    pub(crate) fn with(
+        candidates: Vec<Candidate>,
+        driven: f64,
+        least_fit: f64,
+        settings: &SearchSettings,
+    ) -> Self {
         let mut search = Self {
             candidates,
             driven,
             since_check: 0.0,
+            least_fit,
+            seconds: 0.0,
         };
         search.rank(settings.search.search_candidates);
         search
@@ -223,6 +253,7 @@ impl Search {
     ) -> Option<Estimate> {
         self.driven += motion.x.hypot(motion.y);
         self.since_check += seconds;
+        self.seconds += seconds;
         self.candidates
             .par_iter_mut()
             .for_each(|candidate| candidate.follow(map, scan, motion, seconds, settings));
@@ -307,7 +338,8 @@ impl Search {
         };
         let (scans, seconds) = CONFIRMED_AFTER;
         let followed = best.scans >= scans && best.seconds >= seconds;
-        (followed && explains(best.score) && margin >= needed).then_some(best.estimate)
+        let fits = best.fit() >= self.least_fit * (-self.seconds / LEAST_FIT_FOR).exp();
+        (followed && fits && explains(best.score) && margin >= needed).then_some(best.estimate)
     }
 
     /// The odometry has jumped, and the car is at `stayed`, where it would be without, or at `moved`, where it was carried,
@@ -353,6 +385,8 @@ impl Search {
             candidates: vec![moved, stayed],
             driven: 0.0,
             since_check,
+            least_fit: 0.0,
+            seconds: 0.0,
         })
     }
 }
@@ -468,7 +502,12 @@ mod tests {
     fn of_two_equal_candidates_the_older_stays() {
         let (older, newer) = (candidate(0.0, -3.0, 20, 0.5), candidate(0.1, -1.0, 1, 0.0));
         let elsewhere = candidate(9.0, -2.0, 1, 0.0);
-        let search = Search::with(vec![newer, older, elsewhere], 1.0, &SearchSettings::default());
+        let search = Search::with(
+            vec![newer, older, elsewhere],
+            1.0,
+            0.0,
+            &SearchSettings::default(),
+        );
         assert_eq!(search.candidates, [elsewhere, older]);
     }
 

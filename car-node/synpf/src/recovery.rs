@@ -53,11 +53,11 @@ pub struct RecoveryParameters {
     pub recover: bool,
     /// Below this ratio of the averages the rest of the map is looked at.
     pub check_ratio: f64,
-    /// Alignment below which a pose that nothing speaks for may be wrong.
+    /// Alignment below which the pose of a car that was carried is wrong...
     pub lost_alignment: f64,
-    /// Share of beams that are longer than the map says above which it may be wrong.
+    /// ...beside this share of beams that are longer than the map says.
     pub lost_long_beams: f64,
-    /// How long both must hold until it is given up [s].
+    /// How long both must hold until it is given up, rival or not [s].
     pub lost_after: f64,
     /// Log odds that the history of a pose gives it at most, against all other places.
     pub trust_limit: f64,
@@ -66,7 +66,7 @@ pub struct RecoveryParameters {
     pub piece_odds: f64,
     /// Log odds at which another place is believed.
     pub switch_odds: f64,
-    /// Distance that the car must have driven before that [m].
+    /// Distance that the car must have driven before that [m]; half of it where the scans say that the car was carried.
     pub switch_distance: f64,
 }
 
@@ -181,6 +181,8 @@ struct Since {
 pub(crate) struct Recovery {
     parameters: RecoveryParameters,
     settings: SearchSettings,
+    /// The same with fewer beams, for rivals.
+    rival_settings: SearchSettings,
     continuity: Continuity,
     loss: LossDetector,
     fit_change: FitChangeDetector,
@@ -216,6 +218,9 @@ const PATIENCE: [f64; 2] = [0.1, 4.0];
 /// A rival that leads by so many pieces of wall explains the scans as well.
 const LEADING: f64 = 3.0;
 
+/// Share of the usual fit that another place must have.
+const AS_USUAL: f64 = 0.75;
+
 /// A lead this many times as large as is needed is believed of a car that stands, after so long [s].
 const STANDING: (f64, f64) = (2.0, 0.3);
 
@@ -226,6 +231,7 @@ impl Recovery {
     pub(crate) fn new(parameters: RecoveryParameters, settings: SearchSettings) -> Self {
         Self {
             parameters,
+            rival_settings: settings.with_fewer_beams(),
             settings,
             continuity: Continuity::default(),
             loss: LossDetector::default(),
@@ -245,6 +251,7 @@ impl Recovery {
     /// Other parameters from now on; what was seen so far stays.
     pub(crate) fn set_parameters(&mut self, parameters: RecoveryParameters, settings: SearchSettings) {
         self.parameters = parameters;
+        self.rival_settings = settings.with_fewer_beams();
         self.settings = settings;
     }
 
@@ -429,14 +436,15 @@ impl Recovery {
             reach: reach(map, evidence.scatter),
         };
         self.rivals
-            .follow(incumbent, evidence.motion, evidence.seconds, &self.settings);
+            .follow(incumbent, evidence.motion, evidence.seconds, &self.rival_settings);
         if let Some(candidates) = found {
             self.rivals.add(incumbent, candidates);
         }
         self.ask(scan, doubtful, evidence.seconds);
         if self.lost_to_a_rival() {
             let (candidates, driven) = self.rivals.take(estimate);
-            return self.give_up(Search::with(candidates, driven, &self.settings));
+            let search = Search::with(candidates, driven, self.least_fit(), &self.settings);
+            return self.give_up(search);
         }
         let ratio = self.w_ratio();
         if self
@@ -444,12 +452,18 @@ impl Recovery {
             .contradicted(evidence.quality, ratio, evidence.seconds, &self.parameters)
         {
             let (candidates, driven) = self.rivals.take(estimate);
-            let mut search = Search::with(candidates, driven, &self.settings);
+            let mut search = Search::with(candidates, driven, self.least_fit(), &self.settings);
             search.check_soon();
             return self.give_up(search);
         }
         self.doubt = self.judge();
         Decision::Keep
+    }
+
+    /// The fit that another place must have to be believed: about as good as usual. A map that is out of date has worse places,
+    /// which explain some of what the pose does not.
+    fn least_fit(&self) -> f64 {
+        self.fit_change.usual().map_or(0.0, |usual| AS_USUAL * usual)
     }
 
     fn give_up(&mut self, search: Search) -> Decision {
@@ -522,9 +536,14 @@ impl Recovery {
             return false;
         };
         let p = &self.parameters;
+        if rival.candidate.fit() < self.least_fit() {
+            return false;
+        }
         let needed = (self.loss.odds() + p.switch_odds) / p.piece_odds;
         let (times, after) = STANDING;
-        let moved = rival.driven >= p.switch_distance;
+        // After a break the car is somewhere else in any case.
+        let share = if self.loss.broken(p) { 0.5 } else { 1.0 };
+        let moved = rival.driven >= share * p.switch_distance;
         let beyond_doubt = rival.lead() >= times * needed && self.rivals.seconds() >= after;
         rival.lead() >= needed && moved || beyond_doubt
     }

@@ -24,7 +24,6 @@ use crate::parameters::Parameters;
 use crate::particle_filter::{ParticleFilter, Weighted};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
-use crate::recovery::scan_likelihood::INDEPENDENT;
 use crate::recovery::{Decision, Evidence, Recovery};
 use crate::track_map::TrackMap;
 use crate::tracker::{Tracker, Uncertainty, fit_scan};
@@ -425,7 +424,7 @@ impl SynPf {
         candidates
             .map(|candidate| Hypothesis {
                 pose: map_from_grid * candidate.estimate.pose,
-                fit: (candidate.score / INDEPENDENT).exp(),
+                fit: candidate.fit(),
             })
             .collect()
     }

@@ -37,6 +37,11 @@ const ENOUGH: f64 = 0.3;
 const LEAST_VARIATION: f64 = 0.008;
 
 impl FitChangeDetector {
+    /// The usual fit; None before it is known.
+    pub(crate) fn usual(&self) -> Option<f64> {
+        self.usual.filter(|_| self.seconds > KNOWN).map(|[mean, _]| mean)
+    }
+
     /// Takes in the fit of a scan, in [0, 1], and the time since the one before [s]. True when it has changed for the worse.
     pub(crate) fn push(&mut self, fit: f64, seconds: f64) -> bool {
         let [mean, variation] = *self.usual.get_or_insert([fit, 0.05]);

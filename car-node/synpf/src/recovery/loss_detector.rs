@@ -17,7 +17,7 @@ pub(crate) struct LossDetector {
     breaking: Option<Break>,
     /// A break has lasted.
     carried: bool,
-    /// For how long the scans have contradicted a pose that nothing speaks for [s].
+    /// For how long the scans have contradicted the pose since a break [s].
     contradicted_for: f64,
 }
 
@@ -34,15 +34,15 @@ struct Break {
 const GAIN: f64 = 3.0;
 
 /// Clear alignment from which on a scan counts as fitting, and with which it counts in full: a right pose on a map with
-/// half of its walls changed has 0.5, a wrong one 0.1 to 0.5.
-const FITTING: [f64; 2] = [0.5, 0.8];
+/// half of its walls changed has 0.5, a wrong one 0.1 to 0.5, and then a rival leads soon.
+const FITTING: [f64; 2] = [0.4, 0.8];
 
 /// Clear alignment below which hardly anything fits, and what a metre of that costs [1/m].
 const HOPELESS: f64 = 0.3;
 const LOSS: f64 = 2.0;
 
 /// A break so unlikely to be none is worth a look at the map.
-const DOUBTFUL: f64 = 2.0;
+const DOUBTFUL: f64 = 4.0;
 
 impl LossDetector {
     /// Takes in how a scan goes on from the one before, how it fits, and the way since [m]. `leading` says that another
@@ -98,8 +98,9 @@ impl LossDetector {
         (self.breaking.is_some() || self.carried) && self.odds < parameters.switch_odds
     }
 
-    /// True when a pose that nothing speaks for has been contradicted for long enough: alignment and the beams that reach
-    /// through walls agree, or nearly everything is elsewhere. What stands in view makes beams short, not long.
+    /// True when the car seems to have been carried and the scans have contradicted the pose since for long enough: alignment
+    /// and the beams that reach through walls agree, or nearly everything is elsewhere, or the fit has fallen. Without a
+    /// break a pose is given up for a rival only: the map may be wrong.
     pub(crate) fn contradicted(
         &mut self,
         quality: &Quality,
@@ -112,8 +113,8 @@ impl LossDetector {
         let through_walls = quality.long > parameters.lost_long_beams;
         // Nearly everything short and nothing aligned is no opponent: it is another place.
         let elsewhere = alignment < 0.5 * parameters.lost_alignment && quality.short < 0.8;
-        let fallen = self.broken(parameters) && fit_ratio < parameters.check_ratio;
-        if self.odds < parameters.switch_odds && (low && (through_walls || elsewhere) || fallen) {
+        let fallen = fit_ratio < parameters.check_ratio;
+        if self.broken(parameters) && (low && (through_walls || elsewhere) || fallen) {
             self.contradicted_for += seconds;
         } else {
             self.contradicted_for = 0.0;
@@ -174,11 +175,21 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_nothing_speaks_for_is_given_up_in_the_same_time_at_every_rate() {
+    fn a_carried_car_is_lost_in_the_same_time_at_every_rate_and_another_is_not() {
         let parameters = RecoveryParameters::default();
         for rate in [10.0, 20.0, 40.0] {
-            let mut detector = LossDetector::default();
-            let scans = (1..1000).find(|_| detector.contradicted(&CHANGED, 0.5, 1.0 / rate, &parameters));
+            let contradicted = |detector: &mut LossDetector| {
+                (1..1000).find(|_| detector.contradicted(&CHANGED, 0.5, 1.0 / rate, &parameters))
+            };
+            assert_eq!(contradicted(&mut LossDetector::default()), None);
+            let mut detector = driven();
+            let settled = true;
+            push(
+                &mut detector,
+                Continued::Broken { ratio: 15.0, settled },
+                &CHANGED,
+            );
+            let scans = contradicted(&mut detector);
             let seconds = scans.map_or(f64::INFINITY, |scans| f64::from(scans) / rate);
             assert!(
                 (seconds - parameters.lost_after).abs() < 1e-9,

@@ -5,7 +5,6 @@
 //! beams and scans show it.
 
 use maps::Pose;
-use rayon::prelude::*;
 
 use super::scan_likelihood::{Explained, Pieces, explain, score};
 use crate::estimate::Estimate;
@@ -125,7 +124,7 @@ impl Rivals {
         self.own += averaging(seconds, self.scans) * (score(map, scan, pose) - self.own);
         explain(map, scan, pose, reach, &mut self.explained);
         let (own, driven) = (&self.explained, self.driven as f32);
-        self.list.par_iter_mut().for_each(|rival| {
+        for rival in &mut self.list {
             rival.driven += way;
             rival.candidate.follow(map, scan, motion, seconds, settings);
             explain(
@@ -147,7 +146,7 @@ impl Rivals {
             }
             gained.forget_before(driven - WINDOW as f32);
             lost.forget_before(driven - WINDOW as f32);
-        });
+        }
         let own = self.own;
         self.list.retain(|rival| {
             !nearby(rival.candidate.estimate.pose, pose)

@@ -4,7 +4,7 @@ use maps::Pose;
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
-use crate::{Stamp, Twist};
+use crate::{ScanFit, Stamp, Twist};
 
 /// Why a message did not lead to an update. Each is counted by the caller.
 #[derive(
@@ -112,6 +112,18 @@ pub struct Doubt {
     pub probability: f64,
     /// The rival, `map_from_base_link`; None before one is found.
     pub rival: Option<Pose>,
+}
+
+impl Update {
+    /// How well the scan fits the map at the estimate.
+    pub fn scan_fit(&self) -> ScanFit {
+        ScanFit {
+            alignment: self.alignment,
+            residual: self.residual,
+            short_beams: self.short_beams,
+            long_beams: self.long_beams,
+        }
+    }
 }
 
 /// A pose that a search of the whole map has found, for the operator to choose from.

@@ -1,9 +1,9 @@
-//! What was measured at an update.
+//! The metrics of an update.
 
 use serde::Serialize;
 use synpf::Update;
 
-/// The numbers behind a verdict.
+/// The numbers that a verdict is based on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Metrics {
     /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in [0, 1].
@@ -18,7 +18,7 @@ pub struct Metrics {
     pub no_return: f64,
     /// Effective sample size over the number of particles, in [0, 1].
     pub ess_ratio: f64,
-    /// Short-term over long-term average of the fit of the scan; 1 when all is as usual.
+    /// Short-term over long-term average of the fit of the scan; 1 when nothing changes.
     pub w_ratio: f64,
     /// Standard deviation of the particles along the track [m].
     pub spread_along: f64,
@@ -26,9 +26,9 @@ pub struct Metrics {
     pub spread_across: f64,
     /// Mass of the second cluster over that of the first, in [0, 1].
     pub second_mode: f64,
-    /// Share of odometry's distance that was not driven; positive when the wheels spin.
+    /// Share of odometry's distance that the car did not drive; positive when the wheels spin.
     pub slip: f64,
-    /// Odometry's yaw rate less the posterior's [rad/s].
+    /// Odometry's yaw rate minus the posterior's [rad/s].
     pub yaw_rate_residual: f64,
     /// Distance by which the scan corrected the pose [m].
     pub innovation: f64,
@@ -43,7 +43,7 @@ pub struct Metrics {
 }
 
 impl Metrics {
-    /// Of one update, nothing smoothed and no ages yet.
+    /// Of one update, without smoothing and without ages.
     pub(super) fn of(update: &Update) -> Self {
         Self {
             alignment: update.alignment,

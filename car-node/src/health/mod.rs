@@ -1,5 +1,4 @@
-//! How well the car is localized, and why: every metric of an update held against thresholds, and the state
-//! that follows.
+//! How well the car is localized, and why: compares every metric of an update with thresholds and derives the state.
 //!
 //! ```text
 //!            first pose            0.5 s good and 1 m driven
@@ -10,30 +9,31 @@
 //!              RELOCALIZING <-- LOST            STALE: no sensor data, from any of them
 //! ```
 //!
-//! LOST is said when two independent families of evidence speak for it for 0.3 s, when the scan alone is so far off the
-//! walls that no change of the map explains it, and at the update at which the filter itself gives its pose up to search
-//! the map. An opponent does not count: beams that are cut short in excess of those that are too long are left out.
+//! The state becomes LOST in three cases: two independent families of evidence are against the pose for 0.3 s; the scan
+//! is so far off the walls that no change of the map explains it; or the localizer gives its pose up and searches the map.
+//! An opponent is no evidence: beams that are blocked are left out ([`localizer::ScanFit`]).
 //!
-//! Pure: it reads no clock. Times are stamps of the sensors' clock, given by the caller. What is good, bad or
-//! lost is in [`Thresholds`].
+//! Pure: it reads no clock. The caller gives the times, on the sensors' clock. The limits are in [`Thresholds`].
 
+mod causes;
 mod metrics;
 mod monitor;
+mod pose_ages;
 mod rules;
-mod scan_fit;
+mod sensor_silence;
 mod set_recommender;
 mod slip;
 mod thresholds;
 
 pub use metrics::Metrics;
 pub use monitor::{Monitor, Verdict};
-// A state and its causes are what is told: the words for them are the same on the car as at the wall.
+// The car and the pit wall use the same types for a state and its causes, so that both show the same words.
 pub use protocol::{Cause, CauseKind, Severity, State};
 pub use set_recommender::{Proposal, SetRecommender};
 pub use slip::{SlipEvent, SlipTracker};
 pub use thresholds::Thresholds;
 
-/// What the tests of several modules drive with.
+/// For the tests of several modules.
 #[cfg(test)]
 pub(crate) mod tests_support {
     use maps::Pose;

@@ -1,22 +1,24 @@
 //! The state machine.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 
+use localizer::ScanFit;
 use synpf::{Mode, Stamp, Update};
 
+use super::causes::CauseSources;
+use super::pose_ages::PoseAges;
 use super::rules::{Evidence, Family, Finding, findings};
-use super::scan_fit::ScanFit;
-use super::{Cause, CauseKind, Metrics, Severity, State, Thresholds};
-use crate::statistics::{finite, percentile};
+use super::sensor_silence::SensorSilence;
+use super::{Cause, CauseKind, Metrics, State, Thresholds};
 
-/// The state, with all that led to it.
+/// The state, and what it was concluded from.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Verdict {
     /// The state.
     pub state: State,
     /// When it was entered, on the sensors' clock.
     pub since: Stamp,
-    /// Why, the worst first; empty when all is well.
+    /// Why, the worst first; empty when nothing is wrong.
     pub causes: Vec<Cause>,
     /// The last update; 0 before the first.
     pub update: u64,
@@ -24,42 +26,38 @@ pub struct Verdict {
     pub metrics: Option<Metrics>,
 }
 
-/// Ages of poses are summarised over this long [s].
-const AGE_WINDOW: f64 = 1.0;
+/// A jump of the odometry or of the pose stays in the list of causes for this long [s].
+const JUMP_SHOWN: f64 = 3.0;
 
-/// A jump of the odometry or of the pose is told for so long [s].
-const JUMP_TOLD: f64 = 3.0;
-
-/// Follows one localizer.
+/// Judges one localizer, update by update.
 #[derive(Debug)]
 pub struct Monitor {
     thresholds: Thresholds,
     verdict: Verdict,
-    last_scan: Option<Stamp>,
-    last_odometry: Option<Stamp>,
+    silence: SensorSilence,
     /// Findings of the last update.
     findings: Vec<Finding>,
-    /// Since when each kind has been found without a break.
+    /// Since when each kind has been found in every update.
     found_since: HashMap<CauseKind, Stamp>,
     /// The fit, smoothed over the longer and the shorter time.
     fit: Option<[ScanFit; 2]>,
-    /// Since when each family has said that the pose is wrong.
+    /// Since when each family of evidence has been against the pose.
     lost_since: [Option<Stamp>; Family::COUNT],
-    /// Since when the scan has been off the walls beyond doubt.
+    /// Since when the scan has been so far off the walls that nothing else is needed.
     wrong_since: Option<Stamp>,
     /// Since when nothing has been wrong.
     good_since: Option<Stamp>,
-    /// Driven since the state was entered and since anything was wrong [m].
+    /// Distance driven since the state was entered and since anything was wrong [m].
     driven: f64,
     last_update: Option<Stamp>,
     /// Since when every scan has been refused, and when the last one was.
     refused: Option<[Stamp; 2]>,
-    ages: VecDeque<(Stamp, f64)>,
-    /// When odometry jumped last, and by how far [m].
-    jumped: Option<(Stamp, f64)>,
-    /// When a trusted pose leapt last, and how far [m].
-    leapt: Option<(Stamp, f64)>,
-    /// Where STALE goes back to.
+    ages: PoseAges,
+    /// The last jump of the odometry: when, and how far [m].
+    odometry_jump: Option<(Stamp, f64)>,
+    /// The last jump of a pose that was trusted: when, and how far [m].
+    pose_jump: Option<(Stamp, f64)>,
+    /// The state before STALE.
     before_stale: State,
 }
 
@@ -75,8 +73,7 @@ impl Monitor {
                 update: 0,
                 metrics: None,
             },
-            last_scan: None,
-            last_odometry: None,
+            silence: SensorSilence::default(),
             findings: Vec::new(),
             found_since: HashMap::new(),
             fit: None,
@@ -86,9 +83,9 @@ impl Monitor {
             driven: 0.0,
             last_update: None,
             refused: None,
-            ages: VecDeque::new(),
-            jumped: None,
-            leapt: None,
+            ages: PoseAges::default(),
+            odometry_jump: None,
+            pose_jump: None,
             before_stale: State::Init,
         }
     }
@@ -103,14 +100,14 @@ impl Monitor {
         &self.verdict
     }
 
-    /// Odometry has come in, at `now`.
+    /// Odometry came in at `now`.
     pub fn on_odometry(&mut self, now: Stamp) {
-        self.last_odometry = Some(now);
+        self.silence.on_odometry(now);
     }
 
-    /// A scan has come in at `now` and was refused.
+    /// A scan came in at `now`, and the localizer refused it.
     pub fn on_refused_scan(&mut self, now: Stamp) {
-        self.last_scan = Some(now);
+        self.silence.on_scan(now);
         let [first, _] = self.refused.unwrap_or([now; 2]);
         self.refused = Some([first, now]);
     }
@@ -127,23 +124,24 @@ impl Monitor {
         self.enter(State::Relocalizing, now);
     }
 
-    /// A scan has come in and led to an update; its pose was ready at `now`.
+    /// A scan led to an update; its pose was ready at `now`.
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
-        self.last_scan = Some(now);
+        self.silence.on_scan(now);
         self.refused = None;
         if let Some([distance, _]) = update.odometry_jump {
-            self.jumped = Some((now, distance));
+            self.odometry_jump = Some((now, distance));
         }
-        let leap = self.leap(update);
-        if let Some(distance) = leap {
-            self.leapt = Some((now, distance));
+        let pose_jump = self.pose_jump(update);
+        if let Some(distance) = pose_jump {
+            self.pose_jump = Some((now, distance));
         }
-        // Out of STALE first: what this scan says to the pose is said with it.
-        let missing = self.missing(now);
-        self.stale_or_not(!missing.is_empty(), now);
+        // STALE ends first, so that this scan already counts for the state after it.
+        let silent = self.silent(now);
+        self.stale_or_not(!silent.is_empty(), now);
         let mut metrics = Metrics::of(update);
-        self.add_ages(&mut metrics, update.stamp, now);
-        let [slow, fast] = self.smooth(ScanFit::of(&metrics), update.stamp);
+        self.ages.add(update.stamp, now);
+        [metrics.age_p50, metrics.age_p99] = self.ages.percentiles();
+        let [slow, fast] = self.smooth(update.scan_fit(), update.stamp);
         let evidence = Evidence {
             metrics: &metrics,
             slow,
@@ -153,7 +151,7 @@ impl Monitor {
         };
         self.findings = findings(&evidence, &self.thresholds);
         self.note_times(fast, update.stamp);
-        // By odometry: the estimate of a wrong pose slides about while the car stands.
+        // Driven by odometry: a wrong pose moves about even while the car stands.
         if let (Some(_), Some(last)) = (self.good_since, self.last_update) {
             self.driven += update.twist.linear_x.abs() * update.stamp.since(last).max(0.0);
         } else {
@@ -164,16 +162,16 @@ impl Monitor {
         self.last_update = Some(update.stamp);
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
-        self.advance(update.mode, leap.is_some(), update.stamp, now);
-        self.verdict.causes = self.causes(missing, now);
+        self.advance(update.mode, pose_jump.is_some(), update.stamp, now);
+        self.verdict.causes = self.causes(silent, now);
         &self.verdict
     }
 
-    /// Looks at the clock: without data, the state becomes STALE. Also renews the causes.
+    /// Enters STALE when sensor data is missing at `now`, and renews the causes.
     pub fn tick(&mut self, now: Stamp) -> &Verdict {
-        let missing = self.missing(now);
-        self.stale_or_not(!missing.is_empty(), now);
-        self.verdict.causes = self.causes(missing, now);
+        let silent = self.silent(now);
+        self.stale_or_not(!silent.is_empty(), now);
+        self.verdict.causes = self.causes(silent, now);
         &self.verdict
     }
 
@@ -182,11 +180,11 @@ impl Monitor {
         let stale = self.verdict.state == State::Stale;
         if silent && !stale && self.verdict.state != State::Init {
             self.before_stale = self.verdict.state;
-            // Findings from before a silence do not last across it.
+            // What was found before a silence starts anew after it.
             self.found_since.clear();
             self.enter(State::Stale, now);
         } else if !silent && stale {
-            // Odometry has carried a tracked pose across the gap; anything else starts again.
+            // Odometry carries a tracked pose across the gap; anything else starts again.
             let tracked = matches!(self.before_stale, State::Localized | State::Degraded);
             let state = if tracked {
                 State::Degraded
@@ -208,7 +206,7 @@ impl Monitor {
         self.wrong_since = None;
     }
 
-    /// The fit with this scan in it, over the longer and the shorter time.
+    /// Adds a scan's fit to the two averages: the one over the longer and the one over the shorter time.
     fn smooth(&mut self, fit: ScanFit, stamp: Stamp) -> [ScanFit; 2] {
         let t = &self.thresholds;
         let smoothed = match (self.fit, self.last_update) {
@@ -217,27 +215,14 @@ impl Monitor {
                 let step = |before: ScanFit, time: f64| before.towards(fit, 1.0 - (-seconds / time).exp());
                 [step(before[0], t.smoothing), step(before[1], t.smoothing_lost)]
             }
-            // A new pose has nothing to do with how the one before it fitted.
+            // The fit of the pose before does not count for a new one.
             _ => [fit; 2],
         };
         *self.fit.insert(smoothed)
     }
 
-    fn add_ages(&mut self, metrics: &mut Metrics, stamp: Stamp, now: Stamp) {
-        self.ages.push_back((now, now.since(stamp)));
-        while self
-            .ages
-            .front()
-            .is_some_and(|(at, _)| now.since(*at) > AGE_WINDOW)
-        {
-            self.ages.pop_front();
-        }
-        let ages: Vec<f64> = self.ages.iter().map(|(_, age)| *age).collect();
-        metrics.age_p50 = percentile(&ages, 0.5).unwrap_or_default();
-        metrics.age_p99 = percentile(&ages, 0.99).unwrap_or_default();
-    }
-
-    /// Notes since when each kind was found, each family points to a wrong pose, and nothing has been wrong.
+    /// Notes since when each kind was found, since when each family has been against the pose, and since when nothing has
+    /// been wrong.
     fn note_times(&mut self, fit: ScanFit, stamp: Stamp) {
         let findings = &self.findings;
         self.found_since
@@ -253,14 +238,14 @@ impl Monitor {
             }
         };
         for family in Family::ALL {
-            let speaks = findings.iter().any(|finding| finding.lost == Some(family));
-            note(&mut self.lost_since[family as usize], speaks);
+            let against = findings.iter().any(|finding| finding.lost == Some(family));
+            note(&mut self.lost_since[family as usize], against);
         }
         let off_walls = findings
             .iter()
             .any(|finding| finding.kind == CauseKind::Alignment);
-        let beyond_doubt = fit.clear_alignment() < self.thresholds.alignment_wrong;
-        note(&mut self.wrong_since, off_walls && beyond_doubt);
+        let certain = fit.clear_alignment() < self.thresholds.alignment_wrong;
+        note(&mut self.wrong_since, off_walls && certain);
         if findings.iter().any(|finding| finding.degrades) {
             self.good_since = None;
         } else {
@@ -268,8 +253,8 @@ impl Monitor {
         }
     }
 
-    /// How far a pose that was trusted has leapt with one scan [m]. After a silence it may.
-    fn leap(&self, update: &Update) -> Option<f64> {
+    /// How far a trusted pose jumped with one scan [m]; None if it did not. After a silence a jump is no fault.
+    fn pose_jump(&self, update: &Update) -> Option<f64> {
         let trusted = matches!(self.verdict.state, State::Localized | State::Degraded);
         let next = self
             .last_update
@@ -279,7 +264,8 @@ impl Monitor {
             .then_some(distance)
     }
 
-    fn advance(&mut self, mode: Mode, leapt: bool, stamp: Stamp, now: Stamp) {
+    /// Moves on to the next state.
+    fn advance(&mut self, mode: Mode, jumped: bool, stamp: Stamp, now: Stamp) {
         let t = self.thresholds;
         let good = self
             .good_since
@@ -290,14 +276,14 @@ impl Monitor {
             .iter()
             .filter(|since| lasts(**since, t.lost_after))
             .count();
-        let lost = leapt
+        let lost = jumped
             || families >= 2
             || lasts(self.wrong_since, t.wrong_after)
             || lasts(self.lost_since[Family::EndPoints as usize], t.alone_after);
         let degraded = self.findings.iter().any(|finding| self.lasting(finding));
         let next = match (self.verdict.state, mode) {
             (State::Stale, _) => return,
-            // The filter itself has given its pose up: that it did so is said before what it does about it.
+            // The localizer has given its pose up. LOST comes before RELOCALIZING, so that an operator sees it.
             (State::Converging | State::Localized | State::Degraded, Mode::Searching) => State::Lost,
             (_, Mode::Searching) => State::Relocalizing,
             (_, Mode::Uninitialized) => State::Init,
@@ -325,76 +311,33 @@ impl Monitor {
         finding.degrades && (finding.at_once || lasted())
     }
 
-    /// Which sensors are silent, with the time since they last spoke [s].
-    fn missing(&self, now: Stamp) -> Vec<(CauseKind, f64)> {
-        let silent = |last: Option<Stamp>| {
-            let silence = now.since(last.unwrap_or(self.verdict.since));
-            (silence > self.thresholds.stale_after).then_some(silence)
-        };
-        [
-            (CauseKind::NoScan, silent(self.last_scan)),
-            (CauseKind::NoOdometry, silent(self.last_odometry)),
-        ]
-        .into_iter()
-        .filter_map(|(kind, silence)| Some((kind, silence?)))
-        .collect()
+    /// The sensors that have stopped sending, each with how long ago [s].
+    fn silent(&self, now: Stamp) -> Vec<(CauseKind, f64)> {
+        self.silence
+            .silent(now, self.verdict.since, self.thresholds.stale_after)
     }
 
-    fn causes(&self, missing: Vec<(CauseKind, f64)>, now: Stamp) -> Vec<Cause> {
-        let plain = |kind, severity| Cause {
-            kind,
-            severity,
-            value: None,
-            limit: None,
+    fn causes(&self, silent: Vec<(CauseKind, f64)>, now: Stamp) -> Vec<Cause> {
+        let recent = |jump: Option<(Stamp, f64)>| {
+            jump.filter(|(at, _)| now.since(*at) < JUMP_SHOWN)
+                .map(|(_, distance)| distance)
         };
-        let measured = |kind, severity, value, limit| Cause {
-            value: Some(finite(value)),
-            limit: Some(finite(limit)),
-            ..plain(kind, severity)
-        };
-        let mut causes: Vec<Cause> = missing
-            .into_iter()
-            .map(|(kind, silence)| measured(kind, Severity::Critical, silence, self.thresholds.stale_after))
-            .collect();
-        match self.verdict.state {
-            State::Init => causes.push(plain(CauseKind::NoInitialPose, Severity::Warning)),
-            State::Converging => causes.push(plain(CauseKind::NewPose, Severity::Info)),
-            State::Relocalizing => causes.push(plain(CauseKind::Searching, Severity::Warning)),
-            State::Localized | State::Degraded | State::Lost | State::Stale => {}
-        }
-        if self
-            .refused
-            .is_some_and(|[first, last]| last.since(first) >= self.thresholds.bad_for)
-            && self.verdict.state != State::Init
-        {
-            causes.push(plain(CauseKind::BadSensorData, Severity::Warning));
-        }
-        if let Some((at, distance)) = self.jumped
-            && now.since(at) < JUMP_TOLD
-        {
-            causes.push(Cause {
-                value: Some(finite(distance)),
-                ..plain(CauseKind::OdometryJump, Severity::Warning)
-            });
-        }
-        let leapt = self.leapt.filter(|(at, _)| now.since(*at) < JUMP_TOLD);
-        if let Some((_, distance)) = leapt {
-            causes.push(measured(
-                CauseKind::Innovation,
-                Severity::Critical,
-                distance,
-                self.thresholds.leap,
-            ));
-        }
-        causes.extend(
-            self.findings
+        CauseSources {
+            state: self.verdict.state,
+            thresholds: &self.thresholds,
+            silent,
+            scans_refused: self
+                .refused
+                .is_some_and(|[first, last]| last.since(first) >= self.thresholds.bad_for),
+            odometry_jump: recent(self.odometry_jump),
+            pose_jump: recent(self.pose_jump),
+            findings: self
+                .findings
                 .iter()
                 .filter(|finding| !finding.degrades || self.lasting(finding))
-                .filter(|finding| leapt.is_none() || finding.kind != CauseKind::Innovation)
-                .map(|f| measured(f.kind, f.severity, f.value, f.limit)),
-        );
-        causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
-        causes
+                .collect(),
+        }
+        .causes()
     }
 }
 
@@ -501,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_pose_is_lost_within_half_a_second_and_recovers_by_way_of_converging() {
+    fn a_wrong_pose_is_lost_within_half_a_second_and_converges_again() {
         let mut drive = Drive::localized();
         let states = drive.drive(0.5, wrong_pose);
         assert_eq!(states, [State::Localized, State::Degraded, State::Lost]);
@@ -566,7 +509,7 @@ mod tests {
             drive.drive(0.5, nowhere),
             [State::Localized, State::Degraded, State::Lost]
         );
-        // A pose to start from that was wrong, too.
+        // So is a wrong initial pose.
         let mut drive = Drive::new();
         let states = drive.drive(1.0, nowhere);
         assert_eq!(states, [State::Init, State::Converging, State::Lost]);
@@ -576,7 +519,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_that_have_gone_are_told_and_change_nothing() {
+    fn missing_walls_are_a_cause_but_do_not_change_the_state() {
         let mut drive = Drive::localized();
         let states = drive.drive(3.0, |update| {
             update.alignment = 0.8;
@@ -587,7 +530,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_bad_scan_in_many_degrades_nothing_and_a_limit_is_left_with_a_margin() {
+    fn one_bad_scan_in_ten_does_not_degrade_and_limits_have_hysteresis() {
         let mut drive = Drive::localized();
         for _ in 0..20 {
             assert_eq!(
@@ -617,21 +560,21 @@ mod tests {
     }
 
     #[test]
-    fn a_jump_of_the_odometry_is_told_for_a_while() {
+    fn a_jump_of_the_odometry_stays_a_cause_for_seconds() {
         let mut drive = Drive::localized();
         drive.drive(SCAN, |update| {
             update.mode = Mode::Searching;
             update.odometry_jump = Some([7.0, 0.1]);
         });
         assert_eq!(drive.monitor.verdict().state, State::Lost);
-        let told = drive.monitor.verdict().causes.iter().map(ToString::to_string);
-        assert!(told.eq(["odometry has jumped 7.00 m"]), "{:?}", drive.kinds());
+        let causes = drive.monitor.verdict().causes.iter().map(ToString::to_string);
+        assert!(causes.eq(["odometry has jumped 7.00 m"]), "{:?}", drive.kinds());
         drive.drive(5.0, |_| ());
         assert_eq!(drive.monitor.verdict().causes, []);
     }
 
     #[test]
-    fn a_filter_that_gives_its_pose_up_is_lost_before_it_searches() {
+    fn a_localizer_that_gives_its_pose_up_is_lost_before_it_searches() {
         let mut drive = Drive::localized();
         let searching = |update: &mut Update| update.mode = Mode::Searching;
         assert_eq!(drive.drive(SCAN, searching), [State::Localized, State::Lost]);
@@ -646,7 +589,7 @@ mod tests {
     #[test]
     fn a_pose_is_confirmed_only_by_driving_while_all_is_good() {
         let mut drive = Drive::new();
-        // Good and bad by turns: a wrong place that fits now and then.
+        // A wrong place that fits now and then.
         for _ in 0..10 {
             drive.drive(0.3, |_| ());
             drive.drive(0.3, |update| update.alignment = 0.3);
@@ -670,7 +613,7 @@ mod tests {
     }
 
     #[test]
-    fn slip_and_lost_returns_are_told_but_change_nothing() {
+    fn slip_and_beams_without_a_return_are_causes_but_do_not_change_the_state() {
         let mut drive = Drive::localized();
         let states = drive.drive(2.0, |update| {
             update.slip = 0.25;
@@ -690,7 +633,7 @@ mod tests {
         assert_eq!(
             drive.drive(1.0, |_| ()),
             [State::Degraded, State::Localized],
-            "half a second of good scans mends it"
+            "half a second of good scans is enough"
         );
     }
 
@@ -731,13 +674,13 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_finds_itself_metres_away_was_lost() {
+    fn a_pose_that_jumps_by_metres_was_lost() {
         let leap = |update: &mut Update| update.innovation = [2.7, 0.0];
         let mut drive = Drive::localized();
         assert_eq!(drive.drive(SCAN, leap), [State::Localized, State::Lost]);
-        let told = drive.monitor.verdict().causes.iter().map(ToString::to_string);
+        let causes = drive.monitor.verdict().causes.iter().map(ToString::to_string);
         assert!(
-            told.eq(["pose corrected by a jump 2.70 m (limit 1.00 m)"]),
+            causes.eq(["pose corrected by a jump 2.70 m (limit 1.00 m)"]),
             "{:?}",
             drive.monitor.verdict().causes
         );
@@ -747,7 +690,7 @@ mod tests {
         );
         assert_eq!(drive.monitor.verdict().causes, []);
 
-        // A pose that was not trusted yet may, and so may one of which nothing was seen for a while.
+        // A pose that is not trusted yet may jump. So may any pose after a silence.
         let mut drive = Drive::new();
         drive.drive(0.2, |_| ());
         assert_eq!(drive.drive(SCAN, leap), [State::Converging]);
@@ -758,9 +701,9 @@ mod tests {
     }
 
     #[test]
-    fn silence_is_stale_with_the_sensor_named_and_a_short_one_leads_back() {
+    fn a_silent_sensor_is_named_and_the_state_is_stale_until_it_returns() {
         let mut drive = Drive::localized();
-        // Odometry goes on, scans do not.
+        // Odometry continues, scans do not.
         for _ in 0..40 {
             drive.now = drive.now.plus(SCAN);
             drive.monitor.on_odometry(drive.now);
@@ -780,7 +723,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_at_all_stays_init_and_says_why() {
+    fn without_sensor_data_the_state_stays_init_with_the_causes() {
         let now = Stamp(0);
         let mut monitor = Monitor::new(Thresholds::default(), now);
         let verdict = monitor.tick(now.plus(10.0));

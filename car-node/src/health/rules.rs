@@ -1,18 +1,17 @@
-//! The table of metrics against their thresholds: which are bad, and what they speak for.
+//! The rules: which metrics are over their limits, and what that means for the state.
 
-use localizer::Doubt;
+use localizer::{Doubt, ScanFit};
 
-use super::scan_fit::ScanFit;
 use super::{CauseKind, Metrics, Severity, Thresholds};
 
-/// Families of evidence. Two metrics of one family rise and fall together, so that they count once.
+/// Families of evidence. Metrics of one family rise and fall together, so they count once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Family {
     /// Where the beams end, by the map.
     EndPoints,
-    /// Beams that pass through walls of the map. Only beside the first: a wall that has gone is no wrong pose.
+    /// Beams that pass through walls of the map. Counts only together with the first: a missing wall is no wrong pose.
     LongBeams,
-    /// What the particles look like. Never enough to be lost, together with nothing but itself.
+    /// How the particles are distributed. Never enough for LOST by itself.
     Particles,
 }
 
@@ -32,7 +31,7 @@ pub(super) struct Finding {
     pub(super) degrades: bool,
     /// Whether it does so with a single scan.
     pub(super) at_once: bool,
-    /// What it speaks for when it says that the pose is wrong.
+    /// The family of evidence against the pose that it belongs to; None if it is no such evidence.
     pub(super) lost: Option<Family>,
 }
 
@@ -52,7 +51,7 @@ impl Bad {
     }
 }
 
-/// A metric that degrades the state past `limit`.
+/// A metric that degrades the state when it is past `limit`.
 fn degraded(kind: CauseKind, bad: Bad, value: f64, limit: f64) -> Option<Finding> {
     bad.holds(value, limit).then_some(Finding {
         kind,
@@ -65,7 +64,7 @@ fn degraded(kind: CauseKind, bad: Bad, value: f64, limit: f64) -> Option<Finding
     })
 }
 
-/// A metric that, past `limit`, speaks for a wrong pose.
+/// A metric that is evidence of a wrong pose when it is past `limit`.
 fn lost(kind: CauseKind, bad: Bad, value: f64, limit: f64, family: Family) -> Option<Finding> {
     bad.holds(value, limit).then_some(Finding {
         kind,
@@ -78,7 +77,7 @@ fn lost(kind: CauseKind, bad: Bad, value: f64, limit: f64, family: Family) -> Op
     })
 }
 
-/// A magnitude that says why the pose may soon be bad, not that it is.
+/// A magnitude that warns that the pose may become bad.
 fn hint(kind: CauseKind, severity: Severity, value: f64, limit: f64) -> Option<Finding> {
     (value.abs() > limit).then_some(Finding {
         kind,
@@ -94,15 +93,15 @@ fn hint(kind: CauseKind, severity: Severity, value: f64, limit: f64) -> Option<F
 /// What an update is judged by.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Evidence<'a> {
-    /// This update alone, but for the ages.
+    /// Of this update alone, except for the ages.
     pub(super) metrics: &'a Metrics,
-    /// The fit over the last quarter of a second: single scans do not degrade the state.
+    /// The fit over a quarter of a second, so that single scans do not degrade the state.
     pub(super) slow: ScanFit,
-    /// The fit over the last tenth of a second: a wrong pose shows soon.
+    /// The fit over a tenth of a second, so that a wrong pose shows soon.
     pub(super) fast: ScanFit,
-    /// What speaks against the pose by the localizer's own account.
+    /// The localizer's own doubt about its pose.
     pub(super) doubt: Option<Doubt>,
-    /// The state is good now, so that a limit is only crossed where it says; else all must be better than that.
+    /// The state is good now, so that limits apply as they are. Otherwise they are stricter by the hysteresis.
     pub(super) good: bool,
 }
 
@@ -119,7 +118,7 @@ pub(super) fn findings(evidence: &Evidence<'_>, t: &Thresholds) -> Vec<Finding> 
         .collect()
 }
 
-/// How the scan fits the map; means nothing while an opponent fills the view.
+/// How the scan fits the map. Not judged while an opponent fills the view.
 fn fit(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 2] {
     use Bad::{Above, Below};
     use CauseKind::{Alignment, Residual};
@@ -129,7 +128,7 @@ fn fit(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 2] {
     if fast.blocked() > t.blocked_most {
         return [None; 2];
     }
-    // What stands in view is far from the walls: the residual cannot tell it from a wrong pose.
+    // The end points on an obstacle are far from the walls, as those of a wrong pose are: the residual does not count then.
     let residual = (fast.blocked() < t.blocked_some).then(|| {
         lost(Residual, Above, fast.residual, t.residual_lost, ends).or_else(|| {
             let limit = t.residual_degraded * (1.0 - margin);
@@ -145,7 +144,7 @@ fn fit(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 2] {
     ]
 }
 
-/// Beams through walls: where the scan lies on the walls all the same, the map is out of date.
+/// Beams through walls. Where the scan lies on the walls nevertheless, the map is out of date.
 fn long_beams(evidence: &Evidence<'_>, off_walls: bool, t: &Thresholds) -> Option<Finding> {
     let (kind, share) = (CauseKind::LongBeams, evidence.fast.long_beams);
     if off_walls {
@@ -155,7 +154,7 @@ fn long_beams(evidence: &Evidence<'_>, off_walls: bool, t: &Thresholds) -> Optio
     }
 }
 
-/// What else speaks against the pose.
+/// Metrics of the pose and of the particles.
 fn pose(metrics: &Metrics, t: &Thresholds) -> [Option<Finding>; 5] {
     use Bad::Above;
     use CauseKind::{Age, Innovation, SecondMode, SpreadAcross, SpreadAlong};
@@ -177,7 +176,7 @@ fn pose(metrics: &Metrics, t: &Thresholds) -> [Option<Finding>; 5] {
     ]
 }
 
-/// The localizer doubts its pose: another place explains the scans as well, or the scan does not go on from the one before.
+/// The localizer doubts its pose: another place explains the scans as well, or the scan does not match the one before.
 fn in_doubt(doubt: Doubt) -> Finding {
     Finding {
         kind: if doubt.rival.is_some() {
@@ -194,6 +193,7 @@ fn in_doubt(doubt: Doubt) -> Finding {
     }
 }
 
+/// Metrics that warn, and never degrade the state.
 fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
     use CauseKind::{EffectiveSampleSize, Likelihood, NoReturn, Occluded, Slip, YawRate};
     let m = evidence.metrics;

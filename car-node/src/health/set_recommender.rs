@@ -1,4 +1,4 @@
-//! Which parameter set the odometry calls for.
+//! Recommends a parameter set, HQ or LQ, by the quality of the odometry.
 
 use std::collections::VecDeque;
 
@@ -7,7 +7,7 @@ use synpf::{Stamp, Update};
 
 use super::Thresholds;
 
-/// A set that the car would rather use.
+/// A set that the car recommends.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Proposal {
     /// `hq` or `lq`.
@@ -18,28 +18,28 @@ pub struct Proposal {
     pub since: Stamp,
 }
 
-/// What odometry is worth is judged over this long, about a lap of a small track [s].
+/// Odometry is judged over this long, about a lap of a small track [s].
 const WINDOW: f64 = 8.0;
-/// Nothing is proposed before this much of the window is driven [s].
+/// No proposal before the window is filled this far [s].
 const ENOUGH: f64 = 3.0;
-/// LQ is proposed when more than this share of the scans slip...
+/// LQ is proposed when odometry was wrong at more than this share of the scans.
 const SLIPPING: f64 = 0.20;
-/// ...and HQ when less than this does: the gap keeps the proposal from flickering.
+/// HQ is proposed below this share. The gap between the two prevents a proposal that alternates.
 const GRIPPING: f64 = 0.05;
-/// Slower than this nothing can be said about slip [m/s].
+/// Slip is not judged below this speed [m/s].
 const SLOWEST: f64 = 0.5;
 
-/// Watches slip and yaw rate, update by update.
+/// Judges odometry by slip and yaw rate, update by update.
 #[derive(Debug, Default)]
 pub struct SetRecommender {
-    /// Driving scans of the last seconds: when, and whether odometry was wrong.
+    /// The scans of the last seconds at which the car drove: when, and whether odometry was wrong.
     scans: VecDeque<(Stamp, bool)>,
-    /// The set that odometry calls for.
+    /// The set that suits the odometry.
     wanted: Option<Proposal>,
 }
 
 impl SetRecommender {
-    /// Takes in an update.
+    /// Judges an update.
     pub fn on_update(&mut self, update: &Update, thresholds: &Thresholds) {
         if update.twist.linear_x.abs() < SLOWEST {
             return;
@@ -85,8 +85,8 @@ impl SetRecommender {
         });
     }
 
-    /// The set to use in place of `in_force`; None when that is right, or when it is neither `hq` nor `lq` and
-    /// so somebody's own choice.
+    /// The set to use in place of `in_force`. None when that one is right, or when it is neither `hq` nor `lq`: then somebody
+    /// chose it on purpose.
     pub fn proposal(&self, in_force: &str) -> Option<&Proposal> {
         self.wanted
             .as_ref()
@@ -112,7 +112,7 @@ mod tests {
     fn slipping_calls_for_lq_and_grip_for_hq() {
         let mut recommender = SetRecommender::default();
         drive(&mut recommender, 0.0, 2.0, |_| 0.2);
-        assert_eq!(recommender.proposal("hq"), None, "too early to tell");
+        assert_eq!(recommender.proposal("hq"), None, "too early");
         drive(&mut recommender, 2.0, 3.0, |_| 0.2);
         assert_eq!(recommender.proposal("hq").expect("slips").set, "lq");
         assert_eq!(recommender.proposal("lq"), None);
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn in_between_the_proposal_stays_what_it_was() {
+    fn between_the_two_shares_the_proposal_stays() {
         let tenth = |scan: usize| if scan.is_multiple_of(10) { 0.2 } else { 0.0 };
         let mut recommender = SetRecommender::default();
         drive(&mut recommender, 0.0, 8.0, tenth);

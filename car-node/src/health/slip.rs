@@ -1,36 +1,36 @@
-//! When the wheels slip, and when they grip again.
+//! Events for slipping wheels: when a slip starts, and when it ends.
 
 use synpf::{Stamp, Update};
 
 use super::Thresholds;
 
-/// The wheels slip when they did so for this long: a start from standstill is over sooner [s].
+/// A slip is reported after this long [s]. A start from standstill is over sooner.
 const SLIP_TIME: f64 = 0.3;
-/// The wheels grip again when the slip was below this share of the threshold...
+/// The wheels grip when the slip is below this share of the threshold.
 const GRIP_SHARE: f64 = 0.6;
-/// ...for this long [s].
+/// A slip has ended when the wheels grip for this long [s].
 const GRIP_TIME: f64 = 1.0;
-/// Slower than this, a share of the distance says little [m/s].
+/// Slip is not judged below this speed [m/s]: it is a share of a distance that is too short.
 const SLOWEST: f64 = 1.0;
 
-/// What happened to the grip.
+/// A slip starts or ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum SlipEvent {
-    /// The wheels began to slip.
+    /// The wheels slip.
     Started {
-        /// Share of odometry's distance that was not driven.
+        /// Share of odometry's distance that the car did not drive.
         slip: f64,
     },
     /// They grip again.
     Ended {
-        /// The slip of the largest magnitude in between.
+        /// The slip of the largest magnitude.
         worst: f64,
         /// How long it lasted [s].
         duration: f64,
     },
 }
 
-/// A stretch of slipping.
+/// A slip that has not ended.
 #[derive(Debug, Clone, Copy)]
 struct Slipping {
     since: Stamp,
@@ -38,7 +38,7 @@ struct Slipping {
     worst: f64,
 }
 
-/// Turns a noisy slip into events.
+/// Makes events of the slip of each update.
 #[derive(Debug, Default)]
 pub struct SlipTracker {
     over_since: Option<Stamp>,
@@ -46,7 +46,7 @@ pub struct SlipTracker {
 }
 
 impl SlipTracker {
-    /// Takes in an update.
+    /// Judges an update.
     pub fn on_update(&mut self, update: &Update, thresholds: &Thresholds) -> Option<SlipEvent> {
         let (slip, stamp) = (update.slip, update.stamp);
         if slip.abs() > thresholds.slip && update.twist.linear_x.abs() > SLOWEST {
@@ -105,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stretch_of_slip_is_two_events_with_its_worst_and_its_length() {
+    fn a_slip_is_two_events_the_second_with_its_worst_value_and_its_length() {
         let events = drive(|t| {
             if (2.0..4.0).contains(&t) {
                 -0.1 - 0.01 * t
@@ -122,13 +122,13 @@ mod tests {
     }
 
     #[test]
-    fn a_short_slip_and_a_flickering_one_say_nothing_new() {
+    fn a_short_slip_is_no_event_and_an_intermittent_one_is_one() {
         assert_eq!(drive(|t| if (2.0..2.25).contains(&t) { 0.3 } else { 0.0 }), []);
-        let flickering = drive(|t| if (t * 2.0).fract() < 0.7 { 0.2 } else { 0.0 });
+        let intermittent = drive(|t| if (t * 2.0).fract() < 0.7 { 0.2 } else { 0.0 });
         assert_eq!(
-            flickering.len(),
+            intermittent.len(),
             1,
-            "it begins once and has not ended: {flickering:?}"
+            "it starts once and has not ended: {intermittent:?}"
         );
     }
 }

@@ -1,5 +1,6 @@
 //! How well a scan fits the map at a pose: what an engineer, and the health state, judge by.
 
+use localizer::ScanFit;
 use maps::Pose;
 
 use crate::preprocessed_scan::PreprocessedScan;
@@ -31,11 +32,15 @@ const ALIGNED: f32 = 0.10;
 const OTHER: f32 = 0.3;
 
 impl Quality {
-    /// Alignment of the beams that nothing in view has cut short. A wrong pose makes beams short and long alike, an
-    /// opponent only makes them short: so it is those in excess of the long ones that do not count.
+    /// Alignment of the beams that no obstacle blocks ([`ScanFit::clear_alignment`]).
     pub(crate) fn clear_alignment(&self) -> f64 {
-        let blocked = (self.short - self.long).clamp(0.0, 0.8);
-        (self.alignment / (1.0 - blocked)).min(1.0)
+        let fit = ScanFit {
+            alignment: self.alignment,
+            residual: self.residual,
+            short_beams: self.short,
+            long_beams: self.long,
+        };
+        fit.clear_alignment()
     }
 
     /// Judges a scan at a pose in the grid's frame. Beams that end where nothing was mapped ([`TrackMap::unmapped`]) are not

@@ -1,0 +1,85 @@
+//! The list of causes that goes with a state.
+
+use super::rules::Finding;
+use super::{Cause, CauseKind, Severity, State, Thresholds};
+use crate::statistics::finite;
+
+/// What the causes are made from, at one time.
+pub(super) struct CauseSources<'a> {
+    pub(super) state: State,
+    pub(super) thresholds: &'a Thresholds,
+    /// The sensors that have stopped sending, each with how long ago [s].
+    pub(super) silent: Vec<(CauseKind, f64)>,
+    /// The localizer refuses every scan.
+    pub(super) scans_refused: bool,
+    /// A recent jump of the odometry [m].
+    pub(super) odometry_jump: Option<f64>,
+    /// A recent jump of a pose that was trusted [m].
+    pub(super) pose_jump: Option<f64>,
+    /// The metrics that are over their limits.
+    pub(super) findings: Vec<&'a Finding>,
+}
+
+/// A cause without a number.
+fn plain(kind: CauseKind, severity: Severity) -> Cause {
+    Cause {
+        kind,
+        severity,
+        value: None,
+        limit: None,
+    }
+}
+
+/// A cause with its value and the limit of that value.
+fn measured(kind: CauseKind, severity: Severity, value: f64, limit: f64) -> Cause {
+    Cause {
+        value: Some(finite(value)),
+        limit: Some(finite(limit)),
+        ..plain(kind, severity)
+    }
+}
+
+impl CauseSources<'_> {
+    /// The causes, the worst first.
+    pub(super) fn causes(&self) -> Vec<Cause> {
+        let limits = self.thresholds;
+        let silent = self
+            .silent
+            .iter()
+            .map(|(kind, silence)| measured(*kind, Severity::Critical, *silence, limits.stale_after));
+        let refused = (self.scans_refused && self.state != State::Init)
+            .then(|| plain(CauseKind::BadSensorData, Severity::Warning));
+        let odometry_jump = self.odometry_jump.map(|distance| Cause {
+            value: Some(finite(distance)),
+            ..plain(CauseKind::OdometryJump, Severity::Warning)
+        });
+        let pose_jump = self
+            .pose_jump
+            .map(|distance| measured(CauseKind::Innovation, Severity::Critical, distance, limits.leap));
+        let findings = self
+            .findings
+            .iter()
+            // The jump of the pose is in the list with its own limit.
+            .filter(|finding| pose_jump.is_none() || finding.kind != CauseKind::Innovation)
+            .map(|f| measured(f.kind, f.severity, f.value, f.limit));
+        let mut causes: Vec<Cause> = silent
+            .chain(of_state(self.state))
+            .chain(refused)
+            .chain(odometry_jump)
+            .chain(pose_jump)
+            .chain(findings)
+            .collect();
+        causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
+        causes
+    }
+}
+
+/// The cause that a state has by itself.
+fn of_state(state: State) -> Option<Cause> {
+    match state {
+        State::Init => Some(plain(CauseKind::NoInitialPose, Severity::Warning)),
+        State::Converging => Some(plain(CauseKind::NewPose, Severity::Info)),
+        State::Relocalizing => Some(plain(CauseKind::Searching, Severity::Warning)),
+        State::Localized | State::Degraded | State::Lost | State::Stale => None,
+    }
+}

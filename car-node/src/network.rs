@@ -1,8 +1,8 @@
 //! The network: opens the zenoh session and declares publishers on it.
 //!
-//! The car dials the pit wall as a peer and listens to nobody. It never blocks: what a slow link cannot take is
-//! dropped, and of the streams that must be whole the pit wall asks for what it lacks (`archive.rs`). zenoh-ext's recovery
-//! is not used: it answers from zenoh's receiving thread with blocking replies of any length, which stops a slow link.
+//! The car connects to the pit wall as a peer, and accepts no connections. It never blocks: what a slow link cannot take is
+//! dropped. The pit wall requests missing messages of streams that must be complete (`replay_buffer.rs`). zenoh-ext's recovery
+//! is not used: it replies from zenoh's receiving thread, blocking and without a limit of size, which stops a slow link.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
 
-/// Why there is no link.
+/// Why the network does not work.
 #[derive(Debug, thiserror::Error)]
 pub enum NetworkError {
     /// A setting that zenoh refuses, such as a malformed endpoint.
@@ -42,12 +42,12 @@ pub enum NetworkError {
 /// Where a pit wall on this machine listens.
 const LOCAL_WALL: &str = "tcp/127.0.0.1:7447";
 
-/// What the system may hold of what is sent [bytes]: enough for 10 Mbit/s at 10 ms there and back.
+/// Send buffer of the operating system [bytes]: enough for 10 Mbit/s at a round trip of 10 ms.
 const SEND_BUFFER: usize = 16 * 1024;
-/// What is written to the link in one piece [bytes]: a pose waits for no more than that of a scan.
+/// Size of a batch on the link [bytes]: a pose waits for at most one batch of a scan.
 const BATCH: usize = 8 * 1024;
 
-/// An endpoint as it is given on a command line, or what it should be.
+/// Parses an endpoint of the command line. The error describes the format.
 pub fn endpoint(text: &str) -> Result<String, String> {
     let endpoint = text.parse::<EndPoint>().ok().filter(|endpoint| {
         let port = endpoint
@@ -63,7 +63,8 @@ pub fn endpoint(text: &str) -> Result<String, String> {
     }
 }
 
-/// Opens a session that dials `connect`; without one it looks for a pit wall on this machine and by multicast.
+/// Opens a session that connects to the endpoints `connect`. Without one it looks for a pit wall on this machine and by
+/// multicast.
 pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
     let scout = connect.is_empty().to_string();
     let endpoints = if connect.is_empty() {
@@ -80,20 +81,20 @@ pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
             "connect/retry",
             r#"{"period_init_ms":200,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned(),
         ),
-        // Only cars dial: two that dial each other can end up half connected for good.
+        // Only cars open connections: two peers that connect to each other can stay half connected.
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", scout),
         ("scouting/gossip/enabled", "false".to_owned()),
-        // A cut link is noticed within four seconds. Not sooner: on a radio that loses packets TCP is silent for two now and
-        // then, and to dial again takes longer than to wait.
+        // A cut link is noticed within four seconds. Not sooner: on a radio that loses packets TCP is sometimes silent for two,
+        // and connecting again takes longer than waiting.
         ("transport/link/tx/lease", "4000".to_owned()),
-        // On a slow link what waits should wait here, where a pose overtakes a scan, and not in the system's buffers, where
-        // it does not: those would take megabytes, which is a minute of it.
+        // On a slow link messages should wait in zenoh's queues, where a pose overtakes a scan, and not in the buffers of the
+        // operating system. Those hold megabytes: a minute of a slow link.
         ("transport/link/tcp/so_sndbuf", SEND_BUFFER.to_string()),
         ("transport/link/tx/batch_size", BATCH.to_string()),
         ("transport/link/tx/queue/size/data", "4".to_owned()),
         ("transport/link/tx/queue/size/data_low", "16".to_owned()),
-        // A map takes many pieces, each of which waits for the one before; it goes when there is nothing else to send.
+        // A map is sent in many fragments, each of which waits for the one before. It has the lowest priority.
         (
             "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
             "3000000".to_owned(),
@@ -114,7 +115,7 @@ pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
         .map_err(|error| NetworkError::Open(error.to_string()))
 }
 
-/// Closes a session, but waits no longer than `patience`: on a dead link it would take 12 s.
+/// Closes a session, and waits at most `patience`: on a dead link closing takes 12 s.
 pub fn close(session: &Session, patience: Duration) {
     let session = session.clone();
     let (done, closed) = crossbeam_channel::bounded(1);
@@ -129,7 +130,7 @@ pub fn close(session: &Session, patience: Duration) {
     }
 }
 
-/// Says that the car is there, for as long as the token is kept.
+/// Declares the car as alive, until the token is dropped.
 pub fn declare_alive(session: &Session, car: &CarName) -> Result<LivelinessToken, NetworkError> {
     let key = Key::new(car.clone(), Topic::Alive).to_string();
     session
@@ -142,7 +143,7 @@ pub fn declare_alive(session: &Session, car: &CarName) -> Result<LivelinessToken
         })
 }
 
-/// A way out for one topic: what the link cannot take is dropped, never waited for.
+/// Declares the publisher of a topic. It drops what the link cannot take, and never blocks.
 pub fn declare_publisher(
     session: &Session,
     car: &CarName,

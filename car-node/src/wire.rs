@@ -1,4 +1,4 @@
-//! Between what the car thinks in and what travels: every conversion, in this one file.
+//! Every conversion between the car's own types and those of the protocol.
 
 use maps::{OccupancyGrid, Pose, Raceline};
 use nalgebra::Matrix3;
@@ -29,7 +29,7 @@ pub fn pose2(pose: Pose) -> Pose2 {
     }
 }
 
-/// A pose that came in.
+/// A pose from the network.
 pub fn pose(pose: Pose2) -> Pose {
     Pose::new(pose.x, pose.y, pose.heading)
 }
@@ -141,7 +141,7 @@ fn metrics(metrics: &Metrics) -> protocol::Metrics {
     }
 }
 
-/// A health report. Its times go from the sensors' clock to the wall's.
+/// A health report. Its times are converted from the sensors' clock to wall time.
 pub fn health(report: &HealthReport, clock: &SensorClock) -> Health {
     Health {
         state: report.verdict.state,
@@ -197,7 +197,7 @@ pub fn truth(motion: &TrueMotion) -> Truth {
     }
 }
 
-/// A duration's spread, from seconds to microseconds.
+/// The summary of a duration, from seconds to microseconds.
 pub fn latency(spread: Spread) -> Latency {
     let microseconds = |seconds: f64| finite(seconds * 1e6);
     Latency {
@@ -231,7 +231,7 @@ pub fn map(name: &str, grid: &OccupancyGrid, raceline: Option<&Raceline>) -> Map
     }
 }
 
-/// A candidate of a search; the best has index 0. Its score is the likelihood that its log stands for.
+/// A candidate of a search; the best has index 0.
 pub fn candidate(index: usize, hypothesis: &Hypothesis) -> Candidate {
     Candidate {
         number: u32::try_from(index + 1).unwrap_or(u32::MAX),
@@ -240,7 +240,7 @@ pub fn candidate(index: usize, hypothesis: &Hypothesis) -> Candidate {
     }
 }
 
-/// A parameter's value. None for what no parameter is: null, a list, a table.
+/// A parameter's value. None for what cannot be a parameter: null, a list, a table.
 pub fn value(value: &serde_json::Value) -> Option<Value> {
     Some(match value {
         serde_json::Value::Bool(value) => Value::Bool(*value),
@@ -253,7 +253,7 @@ pub fn value(value: &serde_json::Value) -> Option<Value> {
     })
 }
 
-/// A parameter's value that came in.
+/// A parameter's value from the network.
 pub fn json(value: &Value) -> serde_json::Value {
     match value {
         Value::Bool(value) => (*value).into(),

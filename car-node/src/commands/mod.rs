@@ -4,7 +4,7 @@
     reason = "commands print: results on stdout, the rest on stderr"
 )]
 
-/// A line of a result.
+/// Prints a line of a result.
 macro_rules! say {
     ($($line:tt)*) => { $crate::commands::say(&format!($($line)*)) };
 }
@@ -31,7 +31,7 @@ use synpf::TrackMap;
 
 use crate::cli::{Bags, TopicArguments};
 
-/// Ends the program quietly when nobody reads on, as after `| head`; `println!` would panic.
+/// Prints a line. Ends the program quietly when stdout is closed, as after `| head`; `println!` would panic.
 fn say(line: &str) {
     let mut out = std::io::stdout().lock();
     if let Err(error) = writeln!(out, "{line}") {
@@ -42,7 +42,7 @@ fn say(line: &str) {
     }
 }
 
-/// A fault of the call, and not of what it names: exit code 2, as for what the parser refuses.
+/// Wrong usage of the command line: exit code 2, as for what the parser refuses.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct BadUsage(String);
@@ -51,7 +51,7 @@ pub(crate) struct BadUsage(String);
 fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
     if bags.truth.is_some() && bags.files.len() > 1 {
         bail!(BadUsage(
-            "--truth has the poses of one drive: give one --bag".into()
+            "--truth contains the poses of one drive: give one --bag".into()
         ));
     }
     let files = bags.files.iter().map(PathBuf::as_path);
@@ -65,7 +65,7 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
             log.keep(bags.from, bags.lasting.unwrap_or(f64::INFINITY));
             if log.span().is_none() {
                 let text = format!(
-                    "{}: no scan from {} s on, as --from says",
+                    "{}: --from {}: the bag has no scan after that",
                     bag.display(),
                     bags.from
                 );
@@ -97,7 +97,7 @@ fn load_map(path: &Path) -> anyhow::Result<Arc<TrackMap>> {
     Ok(Arc::new(map))
 }
 
-/// Where the laser is, with a warning when that is a guess.
+/// How the laser is mounted; prints a warning when that is a guess.
 fn mount(bag: &Path, log: &SensorLog) -> Mount {
     log.mount.unwrap_or_else(|| {
         warn_of_guess(&bag.display().to_string());
@@ -105,15 +105,15 @@ fn mount(bag: &Path, log: &SensorLog) -> Mount {
     })
 }
 
-/// Says that nothing told where the laser is.
+/// Prints that the laser's pose is a guess.
 fn warn_of_guess(source: &str) {
     let ahead = Mount::typical().base_link_from_laser.x;
     eprintln!(
-        "car-node: warning: {source}: no /tf_static; laser assumed {ahead} m ahead of base_link (--laser says otherwise)"
+        "car-node: warning: {source}: no /tf_static; the laser is assumed {ahead} m ahead of base_link (--laser sets its pose)"
     );
 }
 
-/// A parameter set, with a warning that lists the keys that mean nothing.
+/// Loads a parameter set. Prints a warning that lists unknown keys.
 fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
     let set = parameter_sets::load(name_or_path).map_err(|error| match error {
         SetError::Unknown(_) => BadUsage(error.to_string()).into(),
@@ -121,18 +121,18 @@ fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
     })?;
     if !set.unknown_keys.is_empty() {
         eprintln!(
-            "car-node: warning: {name_or_path}: keys that mean nothing here: {}",
+            "car-node: warning: {name_or_path}: unknown keys: {}",
             set.unknown_keys.join(", ")
         );
     }
     Ok(set)
 }
 
-/// A bundled track, or the one at a path; `raceline` names a file for its line.
+/// A bundled track, or the one at a path; `raceline` replaces its raceline.
 fn find_track(name_or_path: &str, raceline: Option<&Path>) -> anyhow::Result<Track> {
     if !BUNDLED.contains(&name_or_path) && !Path::new(name_or_path).exists() {
         let bundled = BUNDLED.join(", ");
-        let text = format!("no track {name_or_path:?}: neither a folder or a file nor one of {bundled}");
+        let text = format!("no track {name_or_path:?}: it is no folder, no file and none of {bundled}");
         bail!(BadUsage(text));
     }
     Track::find(name_or_path, raceline).map_err(|error| match &error {
@@ -141,13 +141,13 @@ fn find_track(name_or_path: &str, raceline: Option<&Path>) -> anyhow::Result<Tra
                 && source.kind() == ErrorKind::NotFound
                 && file.ends_with("raceline.csv") =>
         {
-            anyhow::Error::from(error).context("a track needs its raceline; --raceline FILE names another")
+            anyhow::Error::from(error).context("a track needs a raceline; --raceline FILE gives one")
         }
         _ => error.into(),
     })
 }
 
-/// Says why a command failed: each cause once, though some libraries repeat their source's words in their own.
+/// Prints why a command failed. Each cause appears once, although some libraries repeat their source's message in their own.
 pub(crate) fn complain(error: &anyhow::Error) {
     let mut text = String::new();
     for cause in error.chain().map(ToString::to_string) {

@@ -17,7 +17,7 @@ use synpf::TrackMap;
 use super::{find_track, load_set};
 use crate::cli;
 
-/// Some races of one kind, as reported.
+/// The races of one localizer on one tyre, as reported.
 #[derive(Debug, Serialize)]
 struct Report {
     track: String,
@@ -26,12 +26,12 @@ struct Report {
     laps_each: u32,
     seeds: Vec<u64>,
     summary: RaceSummary,
-    /// By seed, then by car; left out of tables.
+    /// By seed, then by car; not in tables.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     races: Vec<Vec<CarResult>>,
 }
 
-/// A car crashed or did not finish: neither a fault of the call (2) nor of the files (1).
+/// Exit code when a car crashed or did not finish. Wrong usage is 2, a faulty file is 1.
 const UNFINISHED: u8 = 3;
 
 pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
@@ -42,7 +42,7 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
     let map = TrackMap::new(track.grid.clone()).with_context(|| arguments.track.clone())?;
     let map = Arc::new(map);
     if arguments.table {
-        // Its rows are there to be compared, and some are there to crash.
+        // The rows are for comparison, and some are expected to crash.
         return table(arguments, &track, &map).map(|()| ExitCode::SUCCESS);
     }
     let (localizer, pose_source) = chosen(arguments)?;
@@ -65,7 +65,7 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
     })
 }
 
-/// What the arguments ask for, and what to call it.
+/// The pose source that the arguments ask for, with its title.
 fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, PoseSource)> {
     Ok(match arguments.localizer {
         cli::PoseSource::Synpf => {
@@ -91,7 +91,7 @@ fn shipped(name: &str) -> anyhow::Result<(String, PoseSource)> {
     Ok((title, PoseSource::Localizer(parameters)))
 }
 
-/// One race for each seed, side by side on the machine's cores.
+/// Runs one race for each seed, in parallel on all cores.
 fn races(
     arguments: &cli::Race,
     track: &Arc<Track>,
@@ -181,7 +181,7 @@ fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyh
     Ok(())
 }
 
-/// A value or a dash.
+/// The value, or a dash.
 fn or_dash(value: Option<f64>, scale: f64, digits: usize) -> String {
     value.map_or("-".into(), |v| format!("{:.digits$}", v * scale))
 }
@@ -268,7 +268,7 @@ fn print_table(arguments: &cli::Race, reports: &[Report]) {
     }
 }
 
-/// Crashes, and who did not finish.
+/// The number of crashes, marked if a car did not finish.
 fn crashes(summary: &RaceSummary) -> String {
     if summary.finished == summary.started {
         summary.crashes.to_string()

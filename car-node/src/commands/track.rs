@@ -53,16 +53,16 @@ fn invented(seed: u64, length: f64, width: f64) -> anyhow::Result<(TrackSpec, St
 fn new(folder: &Path, spec: &TrackSpec, text: &str, force: bool, json: bool) -> anyhow::Result<()> {
     let map = folder.join("map.yaml");
     if map.exists() && !force {
-        bail!("{} is there already; --force overwrites it", map.display());
+        bail!("{} already exists; --force overwrites it", map.display());
     }
     let track = spec.generate().with_context(|| format!("track {}", spec.name))?;
-    // A track that cannot be raced on is shown, with its faults, and not written.
+    // A track that cannot be raced on is printed with its faults, and not written.
     check(&track, json)?;
     track.save(folder, text)?;
     Ok(())
 }
 
-/// Prints what a track is like; fails when it cannot be raced on.
+/// Prints the properties of a track. Fails when it cannot be raced on.
 fn check(track: &Track, json: bool) -> anyhow::Result<()> {
     let report = TrackReport::of(track);
     if json {

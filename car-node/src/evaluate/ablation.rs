@@ -1,8 +1,8 @@
-//! What each improvement over the reference brings: sets between `synpf-baseline` and ours.
+//! Ablation: the sets between `synpf-baseline` and ours, one improvement apart.
 //!
-//! The reference is a localizer of its own. So the sets lead in two parts: the reference with its defects mended one by one;
-//! then SynPF, first with the reference's noise and number of particles and nothing of what is new in it, then with one
-//! improvement after the other.
+//! The reference is a localizer of its own, so there are two parts. The first is the reference, with its defects repaired one
+//! by one. The second is SynPF: first with the reference's noise and number of particles and without its own features, then
+//! with one improvement after the other.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use crate::localization::LocalizerParameters;
 /// An improvement, and the keys that it changes.
 type Improvement = (&'static str, &'static [&'static str]);
 
-/// The reference's defects in the order in which they are mended.
+/// The reference's defects, in the order in which they are repaired.
 const MENDED: [Improvement; 8] = [
     ("turns keep their sign", &["defect_unsigned_rotation"]),
     ("translation noise has mean zero", &["defect_biased_translation"]),
@@ -30,8 +30,8 @@ const MENDED: [Improvement; 8] = [
     ("ranges in 256 directions", &["theta_discretization"]),
 ];
 
-/// What is new in SynPF, in the order in which it is added. What a set changes beyond these comes last, so that the last
-/// row is always the set itself.
+/// The features of SynPF, in the order in which they are added. Other changes of a set come last, so that the last row is
+/// the set itself.
 const IMPROVEMENTS: [Improvement; 9] = [
     ("beams brought to the scan's time", &["deskew"]),
     (
@@ -80,9 +80,9 @@ const IMPROVEMENTS: [Improvement; 9] = [
 pub enum Change {
     /// The reference as it is.
     None,
-    /// The improvement on top of all those before.
+    /// The improvement on top of all the ones before.
     Added,
-    /// SynPF in place of the mended reference.
+    /// SynPF in place of the repaired reference.
     Replaced,
     /// The set with this improvement taken back.
     LeftOut,
@@ -91,18 +91,18 @@ pub enum Change {
 /// One set to try.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Step {
-    /// What changes, for people.
+    /// A description of the change.
     pub name: String,
-    /// How.
+    /// The kind of the change.
     pub change: Change,
-    /// The keys that change, with the value that they get.
+    /// The keys that change, with their new values.
     pub values: BTreeMap<String, Value>,
     /// The set.
     pub parameters: LocalizerParameters,
 }
 
 /// The sets from `synpf-baseline` to `target`, one improvement after the other, and then `target` without each.
-/// Improvements that `target` does not make are left out. Fails where a set in between contradicts itself.
+/// Improvements that `target` does not make are left out. Fails when a set between them is invalid.
 pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFault>> {
     let shipped = LocalizerParameters::from(ReferenceParameters::default());
     let mut steps = vec![Step {
@@ -117,7 +117,7 @@ pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFau
             (shipped, groups)
         }
         LocalizerParameters::SynPf(_) => {
-            let mended = LocalizerParameters::from(mended());
+            let mended = LocalizerParameters::from(repaired());
             add(&mut steps, &groups(&shipped, &mended, &MENDED), &mended)?;
             let plain = LocalizerParameters::from(plain());
             steps.push(Step {
@@ -145,8 +145,8 @@ pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFau
     Ok(steps)
 }
 
-/// The reference without the defects that matter under its shipped parameters.
-fn mended() -> ReferenceParameters {
+/// The reference without the defects that have an effect under its shipped parameters.
+fn repaired() -> ReferenceParameters {
     let mut set = ReferenceParameters {
         theta_discretization: 256,
         ..ReferenceParameters::default()
@@ -161,7 +161,7 @@ fn mended() -> ReferenceParameters {
     set
 }
 
-/// SynPF as near to the mended reference as it comes: its noise, its number of particles, resampled in every update, and
+/// SynPF as similar to the repaired reference as possible: its noise and number of particles, resampling in every update, and
 /// neither fit nor recovery.
 fn plain() -> Parameters {
     let reference = ReferenceParameters::default();
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_set_of_the_reference_is_reached_without_synpf() {
+    fn steps_to_a_set_of_the_reference_do_not_use_synpf() {
         let values = [("defect_deadband", Value::from(false)), ("z_hit", 0.8.into())];
         let values = values.map(|(key, value)| (key.to_owned(), value));
         let (target, _) = named("synpf-baseline").with_values(values).expect("sound");
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn every_key_that_is_named_exists() {
+    fn every_key_exists() {
         for (set, improvements) in [
             ("synpf-baseline", MENDED.as_slice()),
             ("hq", IMPROVEMENTS.as_slice()),
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_improvement_names_comes_last() {
+    fn changes_that_belong_to_no_improvement_come_last() {
         let (target, _) = named("hq")
             .with_values([("z_hit".to_owned(), Value::from(0.8))])
             .expect("sound");

@@ -1,4 +1,4 @@
-//! Errors of a series of estimates against the truth.
+//! Errors of the estimates against the truth.
 
 use maps::{Pose, wrap_angle};
 use serde::Serialize;
@@ -6,14 +6,14 @@ use synpf::Stamp;
 
 use crate::statistics::ErrorSummary;
 
-/// Errors this soon after the first estimate are those of the start, and left out [s].
+/// Errors in the first seconds are those of the start, and do not count [s].
 pub(super) const SETTLING: f64 = 2.0;
-/// Further off than this is an excursion [m]...
+/// A position error above this is an excursion [m].
 const EXCURSION_DISTANCE: f64 = 1.0;
-/// ...when it lasts this long [s].
+/// An excursion counts when it lasts this long [s].
 const EXCURSION_TIME: f64 = 1.0;
 
-/// Collects errors, estimate by estimate.
+/// Collects the errors, estimate by estimate.
 #[derive(Debug, Default)]
 pub struct PoseErrors {
     first: Option<Stamp>,
@@ -21,9 +21,9 @@ pub struct PoseErrors {
     lateral: Vec<f64>,
     longitudinal: Vec<f64>,
     heading: Vec<f64>,
-    /// Since when the estimate has been too far off.
+    /// Since when the estimate has been that wrong.
     off_since: Option<Stamp>,
-    /// The running excursion has been counted.
+    /// The present excursion has been counted.
     counted: bool,
     excursions: usize,
 }
@@ -39,12 +39,12 @@ pub struct Summaries {
     pub longitudinal_error_m: ErrorSummary,
     /// Heading [rad].
     pub heading_error_rad: ErrorSummary,
-    /// Times at which the position was off by more than 1 m for 1 s or more.
+    /// Number of times that the position was wrong by more than 1 m for 1 s or more.
     pub excursions: usize,
 }
 
 impl PoseErrors {
-    /// Adds the estimate for `stamp`. Without truth there it counts for nothing.
+    /// Adds the estimate for `stamp`. Without truth at that time it does not count.
     pub fn push(&mut self, stamp: Stamp, estimate: Pose, truth: Option<Pose>) {
         let first = *self.first.get_or_insert(stamp);
         let Some(truth) = truth else { return };
@@ -58,7 +58,7 @@ impl PoseErrors {
         self.lateral.push(error.y);
         self.heading.push(wrap_angle(error.heading));
 
-        // A NaN is as far off as can be.
+        // A NaN counts as an infinite error.
         if distance <= EXCURSION_DISTANCE {
             self.off_since = None;
             self.counted = false;
@@ -68,7 +68,7 @@ impl PoseErrors {
         }
     }
 
-    /// The errors so far; None without any.
+    /// The summaries; None without an error.
     pub fn summaries(&self) -> Option<Summaries> {
         Some(Summaries {
             position_error_m: ErrorSummary::of(&self.position)?,

@@ -1,4 +1,4 @@
-//! Things that go wrong on a track, done to a log: what the health state says to them can then be measured.
+//! Faults that are added to a log, to measure how the health state reacts.
 
 use std::f64::consts::FRAC_PI_4;
 use std::fmt;
@@ -10,23 +10,21 @@ use synpf::{Scan, Stamp};
 
 use crate::sensors::bag::{Arrival, SensorEvent, SensorLog};
 
-/// What goes wrong.
+/// The kinds of faults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultKind {
-    /// The car is carried on to where it is at the fault's end, and odometry does not notice: this much of the log is
-    /// cut out.
+    /// The car is carried to where it is at the end of the fault, and odometry does not notice: the time between is cut out.
     Kidnap,
-    /// The same piece is cut out and the stamps are closed up, as when a bag is edited; odometry is left as it was logged, and
-    /// its pose jumps.
+    /// The same time is cut out, as from an edited bag. Odometry stays as it was logged, so that its pose jumps.
     Splice,
-    /// No scans come in.
+    /// No scans arrive.
     NoScans,
-    /// No odometry comes in.
+    /// No odometry arrives.
     NoOdometry,
     /// A car drives 0.7 m ahead and blocks the middle 90 deg of the view.
     Blocked,
-    /// Half of the walls are black tubes: in stripes of 10 deg, every other one returns nothing.
+    /// Half of the walls are black tubes: every other stripe of 10 deg has no returns.
     BlackTubes,
 }
 
@@ -40,20 +38,20 @@ impl FaultKind {
         (Self::BlackTubes, "black-tubes"),
     ];
 
-    /// Whether it takes its time out of the log, so that all that follows comes that much earlier.
+    /// True when it cuts its time out of the log, so that everything after it moves by that time.
     pub fn cuts(self) -> bool {
         matches!(self, Self::Kidnap | Self::Splice)
     }
 }
 
-/// Something that goes wrong, for a while. In text: `kidnap@20+4`.
+/// A fault in a log. As text: `kidnap@20+4`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Fault {
-    /// What.
+    /// Its kind.
     pub kind: FaultKind,
-    /// When, from the first scan on [s].
+    /// Its start, after the first scan [s].
     pub at: f64,
-    /// For how long [s].
+    /// Its duration [s].
     pub duration: f64,
 }
 
@@ -98,7 +96,7 @@ impl FromStr for Fault {
 }
 
 impl Fault {
-    /// When the car is to be seen with it, from the first scan on [s]: at its beginning, or behind what it cuts out.
+    /// When it first shows, after the first scan [s]: at its start, or at the end of what it cuts out.
     pub fn shows_at(&self) -> f64 {
         if self.kind.cuts() {
             self.at + self.duration
@@ -107,7 +105,7 @@ impl Fault {
         }
     }
 
-    /// Does it to a log. A log without a scan stays as it is.
+    /// Adds the fault to a log. A log without a scan stays as it is.
     pub fn apply(&self, log: &mut SensorLog) {
         let Some([first, _]) = log.span() else {
             return;
@@ -139,7 +137,7 @@ impl Fault {
         }
     }
 
-    /// Cuts the fault's time out: what comes later comes that much earlier.
+    /// Cuts the time of the fault out of the log.
     fn cut(&self, log: &mut SensorLog, begin: Stamp) {
         let within = |stamp: Stamp| (0.0..self.duration).contains(&stamp.since(begin));
         let close_up = |stamp: &mut Stamp, by: Stamp| {
@@ -160,7 +158,7 @@ impl Fault {
     }
 }
 
-/// Lets odometry go on after `cut` from where it was before.
+/// Makes odometry continue after `cut` from where it was before.
 fn rejoin_odometry(log: &mut SensorLog, cut: Stamp) {
     let (mut before, mut after) = (None, None);
     for arrival in &mut log.arrivals {
@@ -256,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_spliced_log_the_clocks_go_on_and_odometry_jumps_as_far_as_the_car() {
+    fn in_a_spliced_log_time_goes_on_and_odometry_jumps_as_far_as_the_car() {
         let (kidnapped, spliced) = (after("kidnap@4+3"), after("splice@4+3"));
         assert_eq!(spliced.truth, kidnapped.truth);
         let [hidden, jumps] = [&kidnapped, &spliced].map(odometry);
@@ -272,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn a_kidnapped_car_is_elsewhere_and_its_odometry_and_clocks_have_not_noticed() {
+    fn a_kidnapped_car_is_elsewhere_without_a_jump_of_odometry_or_time() {
         let log = after("kidnap@4+3");
         assert_eq!(log.arrivals.len(), 140);
         let odometry = odometry(&log);
@@ -292,13 +290,13 @@ mod tests {
     }
 
     #[test]
-    fn sensors_fall_silent_for_as_long_as_was_said() {
+    fn sensors_are_silent_for_the_duration() {
         assert_eq!(after("no-scans@2+1.5").arrivals.len(), 185);
         assert_eq!(after("no-odometry@2+1.5").arrivals.len(), 185);
     }
 
     #[test]
-    fn beams_are_blocked_and_swallowed_only_meanwhile() {
+    fn beams_are_blocked_and_lost_only_during_the_fault() {
         let ranges = |log: &SensorLog, index: usize| match &log.arrivals[index].event {
             SensorEvent::Scan(scan) => scan.ranges.clone(),
             _ => panic!("no scan"),

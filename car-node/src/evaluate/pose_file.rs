@@ -1,4 +1,4 @@
-//! Poses over time as CSV: what `evaluate --poses` writes, and the truth that other tools give.
+//! Poses over time as CSV: the output of `evaluate --poses`, and ground truth from other tools.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,7 +15,7 @@ const BASE_LINK: [&str; 4] = ["stamp_s", "x_m", "y_m", "heading_rad"];
 /// Columns of poses of the laser.
 const LASER: [&str; 4] = ["stamp_s", "laser_x_m", "laser_y_m", "laser_yaw_rad"];
 
-/// Why a file of poses could not be read.
+/// Why a file of poses cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseFileError {
     /// The file cannot be read, or a line of it is no CSV.
@@ -23,10 +23,10 @@ pub enum PoseFileError {
     Read {
         /// Its path.
         file: String,
-        /// What is wrong.
+        /// The cause.
         source: csv::Error,
     },
-    /// Its first line names no columns that make a pose.
+    /// Its first line does not name the columns of a pose.
     #[error("{file}: no columns {}, nor {}", BASE_LINK.join(","), LASER.join(","))]
     Columns {
         /// Its path.
@@ -41,14 +41,14 @@ pub enum PoseFileError {
         line: u64,
         /// The column's name.
         column: &'static str,
-        /// What is there.
+        /// Its text.
         value: String,
     },
 }
 
 /// Reads poses of `base_link` in `map`. The first line, with or without a `#`, names the columns: `stamp_s x_m y_m
-/// heading_rad` of `base_link`, or `stamp_s laser_x_m laser_y_m laser_yaw_rad` of the laser, which stands at
-/// `base_link_from_laser`; others are ignored. Stamps are the messages', in seconds.
+/// heading_rad` of `base_link`, or `stamp_s laser_x_m laser_y_m laser_yaw_rad` of the laser, which is mounted at
+/// `base_link_from_laser`. Other columns are ignored. Stamps are those of the messages [s].
 ///
 /// # Errors
 /// When the file cannot be read, names no such columns, or a value is no number.
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn the_columns_say_whose_poses_they_are() {
+    fn the_columns_decide_whose_poses_they_are() {
         let own = read("stamp_s,x_m,y_m,heading_rad\n1.5,2,3,0.1\n").expect("reads");
         assert_eq!(own, [(Stamp(1_500_000_000), Pose::new(2.0, 3.0, 0.1))]);
         let laser =

@@ -1,4 +1,4 @@
-//! What the health states are worth, held against the truth.
+//! How often the health states are right, compared with the truth.
 
 use std::collections::BTreeMap;
 
@@ -10,50 +10,50 @@ use super::Fault;
 use super::errors::SETTLING;
 use crate::health::State;
 
-/// LOCALIZED promises a position within this [m]...
+/// LOCALIZED is right within this distance of the truth [m].
 const POSITION: f64 = 0.2;
-/// ...and a heading within this [rad].
+/// LOCALIZED is right within this angle of the truth [rad].
 const HEADING: f64 = 2.0 * std::f64::consts::PI / 180.0;
 
-/// How far LOCALIZED and LOST can be believed, over all updates but those of the first 2 s.
+/// How often LOCALIZED and LOST are right, over all updates but those of the first 2 s.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StateTruth {
     /// Of the updates that were LOCALIZED, the share within 0.2 m and 2 deg of the truth; None without any.
     pub precision: Option<f64>,
     /// Of the updates within 0.2 m and 2 deg of the truth, the share that was LOCALIZED; None without any.
     pub recall: Option<f64>,
-    /// Updates that were LOST though within 0.2 m and 2 deg of the truth.
+    /// Updates in state LOST within 0.2 m and 2 deg of the truth.
     pub false_lost: usize,
-    /// Updates further off than 1 m that were LOCALIZED.
+    /// Updates in state LOCALIZED more than 1 m from the truth.
     pub false_localized: usize,
 }
 
 /// A change of the state.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StateChange {
-    /// When, from the first scan on [s].
+    /// Time since the first scan [s].
     pub at_s: f64,
-    /// The state from then on.
+    /// The new state.
     pub state: State,
     /// True when the estimate was within 0.2 m and 2 deg of the truth; None where that is not known.
     pub right: Option<bool>,
 }
 
-/// What the state said to a fault.
+/// How the health state reacted to a fault.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FaultReport {
     /// The fault.
     pub fault: String,
-    /// From its begin until LOST was said; None when it never was, up to the next fault [s].
+    /// Time from its start to LOST [s]; None if the state was not LOST before the next fault.
     pub lost_after_s: Option<f64>,
-    /// From its begin until STALE was said; None when it never was [s].
+    /// Time from its start to STALE [s]; None if the state was not STALE.
     pub stale_after_s: Option<f64>,
-    /// From its begin until the car was LOCALIZED again after either of them; None when it never was [s].
+    /// Time from its start to LOCALIZED after LOST or STALE [s]; None if the car was not LOCALIZED again.
     pub localized_after_s: Option<f64>,
 }
 
 impl FaultReport {
-    /// From the changes of the state, of which those until `until` [s] count.
+    /// From the changes of the state before `until` [s].
     pub fn new(fault: &Fault, until: f64, changes: &[StateChange]) -> Self {
         let during = || {
             changes
@@ -115,7 +115,7 @@ impl States {
         self.false_localized += usize::from(localized && distance > 1.0);
     }
 
-    /// Takes note of the state between two updates, as when the sensors fall silent.
+    /// Records a change of the state between two updates, as when the sensors are silent.
     pub fn change(&mut self, stamp: Stamp, state: State, right: Option<bool>) {
         let first = *self.first.get_or_insert(stamp);
         if self.changes.last().is_none_or(|change| change.state != state) {
@@ -146,7 +146,7 @@ impl States {
             .collect()
     }
 
-    /// What the states are worth; None without truth.
+    /// How often the states were right; None without truth.
     pub fn truth(&self) -> Option<StateTruth> {
         let share = |part: usize, whole: usize| (whole > 0).then(|| part as f64 / whole as f64);
         (self.judged > 0).then(|| StateTruth {
@@ -158,7 +158,7 @@ impl States {
     }
 }
 
-/// Whether an estimate is what LOCALIZED promises.
+/// True when an estimate is as near to the truth as LOCALIZED requires.
 fn right(estimate: Pose, truth: Pose) -> bool {
     estimate.distance(truth) < POSITION && wrap_angle(estimate.heading - truth.heading).abs() < HEADING
 }
@@ -168,7 +168,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn precision_and_recall_count_what_they_should() {
+    fn precision_and_recall_count_the_right_updates() {
         let mut states = States::default();
         let at = |second: i64| Stamp(second * 1_000_000_000);
         let (near, far) = (Pose::new(0.1, 0.0, 0.0), Pose::new(1.5, 0.0, 0.0));

@@ -1,4 +1,4 @@
-//! Where the car really was.
+//! Ground truth.
 
 use maps::Pose;
 use synpf::Stamp;
@@ -10,14 +10,14 @@ pub struct Truth {
     samples: Vec<(Stamp, Pose)>,
 }
 
-/// Across a longer gap the truth is not known well enough to hold an estimate against it [s].
+/// Across a longer gap the truth is too uncertain to compare an estimate with [s].
 const LONGEST_GAP: f64 = 0.2;
 
-/// Stamps that a text file gives may be rounded by so much [s].
+/// Stamps in a text file may be rounded by this much [s].
 const ROUNDING: f64 = 1e-6;
 
 impl Truth {
-    /// From samples in any order. Of two with one stamp the first counts; those that are not finite do not.
+    /// From samples in any order. Of two with the same stamp the first counts. Samples that are not finite are ignored.
     pub fn new(mut samples: Vec<(Stamp, Pose)>) -> Self {
         samples.retain(|(_, pose)| pose.is_finite());
         samples.sort_by_key(|(stamp, _)| *stamp);
@@ -25,7 +25,7 @@ impl Truth {
         Self { samples }
     }
 
-    /// True when nothing is known.
+    /// True without any sample.
     pub fn is_empty(&self) -> bool {
         self.samples.is_empty()
     }

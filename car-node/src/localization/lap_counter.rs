@@ -3,14 +3,13 @@
 use maps::{Raceline, TrackPosition};
 use synpf::Stamp;
 
-/// A lap begins when `s` falls by more than this share of the track's length: over the start line, not back
-/// and forth about some other point.
+/// The start line is crossed when `s` changes by more than this share of the track's length in one step.
 const WRAP: f64 = 0.5;
 
-/// What crossing the start line said.
+/// A crossing of the start line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Crossing {
-    /// The lap that has ended; 0 for the first crossing, which ends no whole lap.
+    /// The lap that ended; 0 for the first crossing, which ends no whole lap.
     pub ended: u32,
     /// Its time [s]; None for the first crossing.
     pub time: Option<f64>,
@@ -23,8 +22,8 @@ pub struct LapCounter {
     begun_at: Option<Stamp>,
     /// Laps begun; 0 before the first crossing.
     begun: u32,
-    /// Crossings backwards that must be undone before one forwards counts.
-    owed: u32,
+    /// Crossings in reverse. Each cancels one crossing forwards.
+    reversed: u32,
 }
 
 impl LapCounter {
@@ -33,25 +32,25 @@ impl LapCounter {
         self.begun
     }
 
-    /// Forgets where the car was: a new pose is no motion.
+    /// The localizer got a new pose: the step to it is no motion.
     pub fn on_new_pose(&mut self) {
         self.last = None;
     }
 
-    /// Takes in a position; tells of a crossing of the start line, at the interpolated time.
+    /// Adds a position. Returns a crossing of the start line, at its interpolated time.
     pub fn on_position(&mut self, stamp: Stamp, at: TrackPosition, line: &Raceline) -> Option<Crossing> {
         let length = line.length();
         let (last_stamp, last_s) = self.last.replace((stamp, at.s))?;
         let step = at.s - last_s;
         if step > WRAP * length {
-            self.owed += 1;
+            self.reversed += 1;
             return None;
         }
         if step > -WRAP * length {
             return None;
         }
-        if self.owed > 0 {
-            self.owed -= 1;
+        if self.reversed > 0 {
+            self.reversed -= 1;
             return None;
         }
         let driven = step + length;
@@ -85,7 +84,7 @@ mod tests {
         Raceline::through(&points, 3.0).expect("a line")
     }
 
-    /// Drives along `arc(t)`, 40 positions a second; all crossings.
+    /// Drives along `arc(t)` with 40 positions a second, and returns all crossings.
     fn drive(seconds: f64, arc: impl Fn(f64) -> f64) -> Vec<Crossing> {
         let (line, mut laps) = (circle(), LapCounter::default());
         (0..(seconds * 40.0) as usize)
@@ -101,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn lap_times_are_those_of_the_speed() {
+    fn lap_times_follow_from_the_speed() {
         let length = circle().length();
         let crossings = drive(40.0, |t| 3.0 * t + 10.0);
         let first = crossings.first().expect("one");

@@ -1,4 +1,4 @@
-//! Scan alignment as the paper's code measures it.
+//! Scan alignment as defined by the paper's code.
 
 use maps::Pose;
 use synpf::{Scan, TrackMap};
@@ -6,16 +6,16 @@ use synpf::{Scan, TrackMap};
 /// An end point nearer than this to the boundary is aligned [m].
 pub const PAPER_DISTANCE: f64 = 0.22;
 
-/// Beams that are looked at.
+/// Number of beams used.
 const BEAMS: usize = 54;
 
-/// Share of some 54 beams, dense straight ahead and sparse to the sides, whose end points lie within 0.22 m of the track's
-/// boundary; beams without a return count as misses (`race_stack`'s lap analyser). It draws the beams from a normal
-/// distribution; we take that distribution's quantiles, three standard deviations being the field of view's edge, so that
-/// the same scan always gives the same number.
+/// Share of 54 beams whose end points lie within 0.22 m of the track's boundary (`race_stack`'s lap analyser). The beams are
+/// dense straight ahead and sparse to the sides; those without a return count as misses. `race_stack` draws the beams from a
+/// normal distribution whose three standard deviations are the edge of the field of view. We take the quantiles of that
+/// distribution, so that the same scan always gives the same number.
 ///
 /// `map_from_base_link` is the pose at the scan's stamp and `twist` the velocity then (forwards [m/s], yaw rate [rad/s]):
-/// each beam is placed where it was measured, or a good pose would be blamed for the sweep.
+/// each beam is placed where it was measured, so that the sweep does not count as an error of the pose.
 pub fn paper_alignment(
     map: &TrackMap,
     scan: &Scan,

@@ -1,11 +1,11 @@
-//! Races: simulated cars that drive on what a localizer tells them, lap after lap, and the measures of the paper.
+//! Races: simulated cars that drive on a localizer's estimates, measured as the paper does.
 //!
-//! The loop is closed: a bad estimate steers the car off its line and costs time. No network, no clock: a race is as fast
-//! as the machine, and the same setup gives the same race (only [`LoadSummary`] is measured on this machine).
+//! The loop is closed: a wrong estimate steers the car off its line and costs time. There is no network and no clock: a race
+//! runs as fast as the machine allows, and the same setup gives the same race. Only [`LoadSummary`] depends on the machine.
 
 mod alignment;
-mod metrics;
 mod paper;
+mod results;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -18,20 +18,20 @@ use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Tr
 use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
-pub use metrics::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary};
 pub use paper::{PAPER_ROWS, PaperRow};
+pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary};
 
 use crate::health::{Monitor, Thresholds};
 use crate::localization::LocalizerParameters;
 use crate::sensors::{Script, ScriptedIncident};
-use metrics::Recorder;
+use results::CarMeasurements;
 
-/// What tells the driver where the car is.
+/// Where a driver gets the car's pose from.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PoseSource {
-    /// The filter with a parameter set.
+    /// A localizer with a parameter set.
     Localizer(LocalizerParameters),
-    /// Wheel odometry alone, from a perfect start.
+    /// Wheel odometry alone, from the true start.
     Odometry,
     /// The truth, as an upper bound.
     Truth,
@@ -43,12 +43,12 @@ pub enum PoseSource {
 pub enum Quality {
     /// Clean tyres: odometry is good.
     Hq,
-    /// Taped tyres: they slip, and odometry lies.
+    /// Taped tyres: they slip, and odometry is wrong.
     Lq,
 }
 
 impl Quality {
-    /// The grip that makes the odometry so.
+    /// The grip of these tyres.
     pub fn grip(self) -> Grip {
         match self {
             Self::Hq => Grip::HQ,
@@ -57,12 +57,12 @@ impl Quality {
     }
 }
 
-/// Speed over the raceline's own, the same on all tyres, as the paper drove both conditions at one scaling. Calibrated: with it
-/// a car that knows the truth laps `club` on clean tyres in the time of the paper's cars. Only what a condition or a localizer
-/// changes about a lap time says something, not the lap time itself.
+/// Speed as a share of the raceline's. It is the same on all tyres: the paper drove both conditions at one scaling. It is
+/// calibrated: with it a car that drives on the truth laps `club` on clean tyres in the time of the paper's cars. So a lap time
+/// itself has no meaning; its differences between tyres and localizers have.
 pub const SPEED_SCALE: f64 = 0.995;
 
-/// A race.
+/// The setup of a race.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RaceSetup {
     /// Laps for every car.
@@ -71,18 +71,18 @@ pub struct RaceSetup {
     pub cars: usize,
     /// Grip.
     pub quality: Quality,
-    /// What every car goes by.
+    /// Where every driver gets the pose from.
     pub pose_source: PoseSource,
-    /// Speed over the raceline's own, beside [`SPEED_SCALE`].
+    /// Factor on the speed, on top of [`SPEED_SCALE`].
     pub speed_scale: f64,
-    /// Decides every random number.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
-/// Gap between two cars at the start, along the line [m].
+/// Gap between two cars at the start, along the raceline [m].
 const GRID_GAP: f64 = 3.0;
 
-/// Runs a race to its end: all laps driven, or four times the time they should take. `map` is the track's map, made ready
+/// Runs a race until all laps are driven, or four times their expected time has passed. `map` is the track's map, prepared
 /// once for all races.
 pub fn race(
     track: &Arc<Track>,
@@ -105,12 +105,12 @@ pub fn race(
     )
 }
 
-/// When a race is over.
+/// When a race ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct End {
-    /// When all cars have driven so many laps; None waits for the time.
+    /// When all cars have driven this many laps; None: after `time` only.
     pub laps: Option<u32>,
-    /// After this long at the latest.
+    /// After this time at the latest.
     pub time: Duration,
 }
 
@@ -127,7 +127,7 @@ fn field(setup: &RaceSetup) -> Vec<CarSetup> {
         .collect()
 }
 
-/// Runs a race of any cars, to which things may happen. Cars that go by the truth have no localizer, whatever `pose_source` says.
+/// Runs a race of any cars, with incidents. Cars that are guided by the truth have no localizer, whatever `pose_source` is.
 pub fn run(
     track: &Arc<Track>,
     map: &Arc<TrackMap>,
@@ -149,7 +149,7 @@ pub fn run(
         end.laps.is_some_and(|laps| {
             runners
                 .iter()
-                .all(|runner| runner.recorder.laps() >= laps as usize)
+                .all(|runner| runner.measurements.laps() >= laps as usize)
         })
     };
     while !done(&runners) && world.now() < end.time {
@@ -164,15 +164,15 @@ pub fn run(
     let elapsed = begin.elapsed();
     Ok(runners
         .into_iter()
-        .map(|runner| runner.recorder.result(world.now(), elapsed, end.laps))
+        .map(|runner| runner.measurements.result(world.now(), elapsed, end.laps))
         .collect())
 }
 
-/// One car's localizer and everything that is noted of it.
+/// One car's localizer and its measurements.
 struct CarRunner {
     pose_source: ActivePoseSource,
-    recorder: Recorder,
-    /// True poses of the last half second, for estimates that are about the past.
+    measurements: CarMeasurements,
+    /// True poses of the last half second, for estimates of the past.
     truths: VecDeque<(Stamp, Pose)>,
     base_link_from_laser: Pose,
     latest: Option<simulator::Odometry>,
@@ -200,7 +200,7 @@ impl CarRunner {
             _ if car.guidance == Guidance::Truth => ActivePoseSource::Truth,
             PoseSource::Localizer(parameters) => {
                 let seed = seed.wrapping_add(index as u64);
-                // A car's tables are ready before it starts.
+                // The tables are built before the start.
                 parameters.prepare_tables(map, Some(start));
                 let mut localizer = parameters.build(map, base_link_from_laser, seed)?;
                 localizer.initialize(start)?;
@@ -213,21 +213,21 @@ impl CarRunner {
         };
         Ok(Self {
             pose_source,
-            recorder: Recorder::new(Arc::clone(world.track()), Arc::clone(map)),
+            measurements: CarMeasurements::new(Arc::clone(world.track()), Arc::clone(map)),
             truths: VecDeque::new(),
             base_link_from_laser,
             latest: None,
         })
     }
 
-    /// Passes a message on to the localizer. Returns an estimate when there is a new one.
+    /// Gives a message to the localizer. Returns a new estimate, if there is one.
     fn handle(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
         match message {
             Message::Odometry(odometry) => {
                 self.latest = Some(*odometry);
                 let pose = self.on_odometry(odometry, world, index)?;
-                self.recorder.on_a_lap = world.on_a_lap(index);
-                self.recorder.driven(pose, world.truth(index).track.d);
+                self.measurements.on_a_lap = world.on_a_lap(index);
+                self.measurements.driven(pose, world.truth(index).track.d);
                 Some(Estimate {
                     time: odometry.stamp,
                     pose,
@@ -241,7 +241,7 @@ impl CarRunner {
                         stamp: stamp(gyro.stamp),
                         rate: gyro.yaw_rate,
                     };
-                    self.recorder.timed(|| localizer.on_yaw_rate(&reading)).ok();
+                    self.measurements.timed(|| localizer.on_yaw_rate(&reading)).ok();
                 }
                 None
             }
@@ -277,7 +277,7 @@ impl CarRunner {
                 None
             }
             Message::Lap(lap) => {
-                self.recorder.lap(lap.time);
+                self.measurements.lap(lap.time);
                 None
             }
             Message::Crash(contact) => self.mishap(world, index, MishapKind::Crash, contact.impact),
@@ -287,14 +287,14 @@ impl CarRunner {
         }
     }
 
-    /// Notes what went wrong. There is no estimate in it.
+    /// Records a mishap. Returns None, since it gives no estimate.
     fn mishap(&mut self, world: &World, index: usize, kind: MishapKind, impact: f64) -> Option<Estimate> {
         let manoeuvre = world.manoeuvre(index);
         let [at, s, d] = {
             let truth = world.truth(index);
             [truth.stamp.as_secs_f64(), truth.track.s, truth.track.d]
         };
-        self.recorder.mishap(Mishap {
+        self.measurements.mishap(Mishap {
             at_s: at,
             kind,
             s_m: s,
@@ -320,7 +320,7 @@ impl CarRunner {
                         angular: odometry.yaw_rate,
                     },
                 };
-                self.recorder.timed(|| {
+                self.measurements.timed(|| {
                     localizer.on_odometry(&message).ok();
                     localizer.predict(message.stamp)
                 })
@@ -333,7 +333,7 @@ impl CarRunner {
         }
     }
 
-    /// Lets the localizer take in a scan and notes how good it is. Returns the pose now, if the scan changed it.
+    /// Gives a scan to the localizer and records how good the estimate is. Returns the pose now, if the scan changed it.
     fn on_scan(&mut self, scan: &simulator::Scan, now: Stamp) -> Option<Pose> {
         let message = Scan {
             stamp: stamp(scan.stamp),
@@ -346,7 +346,7 @@ impl CarRunner {
         };
         let truth = self.truth_at(message.stamp);
         let ActivePoseSource::Localizer(localizer, monitor) = &mut self.pose_source else {
-            // What has no opinion of scans is judged by where it says the car is, or the truth.
+            // Without a localizer, the scan is judged at the pose by odometry, or at the true pose.
             let pose = match &self.pose_source {
                 ActivePoseSource::Odometry(map_from_odom, _) => {
                     let latest = self.latest?;
@@ -359,18 +359,18 @@ impl CarRunner {
             let twist = self
                 .latest
                 .map_or([0.0; 2], |latest| [latest.speed, latest.yaw_rate]);
-            self.recorder
+            self.measurements
                 .scanned(&message, pose, twist, truth, None, self.base_link_from_laser);
             return None;
         };
-        let Ok(update) = self.recorder.timed_update(|| localizer.on_scan(&message)) else {
+        let Ok(update) = self.measurements.timed_update(|| localizer.on_scan(&message)) else {
             monitor.on_refused_scan(now);
             return None;
         };
         let state = monitor.on_update(&update, now).state;
-        self.recorder.judged(update.stamp, state, update.pose, truth);
+        self.measurements.judged(update.stamp, state, update.pose, truth);
         let twist = [update.twist.linear_x, update.twist.angular];
-        self.recorder.scanned(
+        self.measurements.scanned(
             &message,
             update.pose,
             twist,
@@ -381,7 +381,7 @@ impl CarRunner {
         localizer.predict(stamp(self.latest?.stamp))
     }
 
-    /// The true pose at `time`, between the two noted next to it.
+    /// The true pose at `time`, interpolated.
     fn truth_at(&self, time: Stamp) -> Option<Pose> {
         let after = self.truths.partition_point(|(stamp, _)| *stamp < time);
         let (t1, to) = *self.truths.get(after)?;
@@ -395,12 +395,12 @@ impl CarRunner {
     }
 }
 
-/// The simulator counts from the start; the localizer only compares.
+/// The simulator's time as a stamp. It starts at zero; a localizer only uses differences.
 fn stamp(time: Duration) -> Stamp {
     Stamp(time.as_nanos() as i64)
 }
 
-/// Race time that one tick takes; real time is kept by a race that takes less for it.
+/// Simulated time of one tick.
 pub const RACE_TICK: Duration = TICK;
 
 #[cfg(test)]
@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn on_the_truth_a_lap_of_club_takes_what_the_paper_s_took() {
+    fn on_the_truth_a_lap_of_club_takes_as_long_as_the_paper_s() {
         let (track, map) = club();
         let results = race(&track, &map, &setup(PoseSource::Truth, 2, 1)).expect("a race");
         let [car] = &results[..] else { panic!("one car") };
@@ -437,13 +437,13 @@ mod tests {
         for lap in &car.laps {
             assert!((9.0..9.6).contains(&lap.time_s), "{} s", lap.time_s);
         }
-        // The truth is never wrong, but for how it is interpolated.
+        // The only error of the truth is interpolation.
         let errors = car.pose_error.expect("errors");
         assert!(errors.position_error_m.max < 0.005);
     }
 
     #[test]
-    fn a_race_tells_its_states_and_what_went_wrong_with_its_cause() {
+    fn a_race_reports_states_and_mishaps_with_their_causes() {
         let (track, map) = club();
         let parameters = LocalizerParameters::named("hq").expect("ships");
         let setup = setup(PoseSource::Localizer(parameters), 1, 1);
@@ -468,7 +468,7 @@ mod tests {
         .expect("a race");
         let [car] = &results[..] else { panic!("one car") };
         let spin = car.mishaps.iter().find(|mishap| mishap.kind == MishapKind::Spin);
-        let spin = spin.expect("15 rad/s turn any car round");
+        let spin = spin.expect("15 rad/s spin any car");
         assert!((6.0..7.0).contains(&spin.at_s), "{spin:?}");
         assert!(spin.pose_error_m.is_some_and(|error| error < 0.3), "{spin:?}");
         assert_eq!(
@@ -486,9 +486,8 @@ mod tests {
     }
 
     #[test]
-    fn a_car_that_slips_and_knows_its_turning_from_the_steering_alone_races_on() {
-        // In the demo it span in every lap, and all cars queued behind it: its driver took what he had commanded for
-        // what the car did.
+    fn a_slipping_car_with_yaw_rate_from_steering_finishes_its_race() {
+        // In the demo this car spun in every lap: its driver took the commanded yaw rate for the car's own.
         let (track, map) = club();
         let setup = RaceSetup {
             quality: Quality::Lq,

@@ -1,4 +1,4 @@
-//! What the paper reports, to stand beside ours.
+//! The paper's results, for comparison with ours.
 
 use serde::Serialize;
 
@@ -9,9 +9,9 @@ use super::Quality;
 /// is here.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PaperRow {
-    /// Which localizer.
+    /// The localizer.
     pub localizer: &'static str,
-    /// On which tyres.
+    /// The tyres.
     pub quality: Quality,
     /// Lap time, mean and sigma [s].
     pub lap_time_s: [f64; 2],
@@ -19,7 +19,7 @@ pub struct PaperRow {
     pub line_error_m: [f64; 2],
     /// Scan alignment, in [0, 1].
     pub alignment: f64,
-    /// Load, as the paper gives it, where it does [%].
+    /// Load, where the paper reports it [%].
     pub load: Option<f64>,
 }
 
@@ -32,7 +32,7 @@ pub const PAPER_ROWS: [PaperRow; 4] = [
     row("Cartographer", Quality::Lq, [9.428, 0.126], [11.432, 1.134], 61.710, None),
 ];
 
-/// A row in the paper's units: centimetres and percent.
+/// Makes a row from the paper's units: centimetres and percent.
 const fn row(
     localizer: &'static str,
     quality: Quality,

@@ -1,4 +1,4 @@
-//! What is noted during a race, and what is said of it afterwards.
+//! What is measured during a race, and its summary.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -17,9 +17,9 @@ use crate::statistics::{MeanSigma, mean, percentile};
 /// One finished lap.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LapRecord {
-    /// From line to line [s].
+    /// Lap time [s].
     pub time_s: f64,
-    /// Mean distance of the *estimate* from the raceline, as the paper takes it [m].
+    /// Mean distance of the *estimate* from the raceline, as the paper defines it [m].
     pub line_error_m: f64,
     /// Mean distance of the car from the raceline [m].
     pub true_line_error_m: f64,
@@ -27,86 +27,86 @@ pub struct LapRecord {
     pub alignment_paper: f64,
 }
 
-/// Time that the localizer took on this machine.
+/// CPU time of the localizer on this machine.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct LoadSummary {
-    /// CPU seconds of the localizer per second of race.
+    /// CPU seconds of the localizer per second of the race.
     pub cpu: f64,
     /// Whole update, median [us].
     pub update_us_p50: f64,
-    /// Whole update, 99 of 100 are faster [us].
+    /// Whole update, 99th percentile [us].
     pub update_us_p99: f64,
-    /// Race seconds per second that this race took, simulator and all.
+    /// Seconds of the race per second of computing, with the simulator.
     pub real_time_factor: f64,
 }
 
-/// What went wrong with a car.
+/// The kinds of mishaps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MishapKind {
-    /// It hit a wall and had to be put back.
+    /// The car hit a wall and had to be put back.
     Crash,
-    /// It touched a wall and went on.
+    /// The car touched a wall and drove on.
     Scrape,
-    /// It touched another car.
+    /// The car touched another car.
     Collision,
-    /// It turned round.
+    /// The car spun.
     Spin,
 }
 
-/// Something that went wrong, with what tells the cause.
+/// A mishap, with values that show its cause.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Mishap {
-    /// When, since the start of the race [s].
+    /// Time since the start of the race [s].
     pub at_s: f64,
-    /// What.
+    /// Its kind.
     pub kind: MishapKind,
-    /// Where along the raceline [m].
+    /// Arc length along the raceline [m].
     pub s_m: f64,
-    /// How far beside it, left positive [m].
+    /// Distance from the raceline, left positive [m].
     pub d_m: f64,
-    /// Speed into what was touched [m/s].
+    /// Speed of the impact [m/s].
     pub impact_mps: f64,
-    /// False when the car was being turned round.
+    /// False while the car was being turned round after a spin.
     pub racing: bool,
-    /// How far off the estimate was at the last scan; None without one [m].
+    /// Error of the estimate at the last scan [m]; None without one.
     pub pose_error_m: Option<f64>,
 }
 
-/// One car's race.
+/// The result of one car.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CarResult {
     /// True when all laps were driven in time.
     pub finished: bool,
     /// The laps, in order.
     pub laps: Vec<LapRecord>,
-    /// Times the car hit a wall and had to be put back.
+    /// Crashes: the car hit a wall and had to be put back.
     pub crashes: u32,
-    /// Times it touched a wall and went on.
+    /// Scrapes: the car touched a wall and drove on.
     pub scrapes: u32,
-    /// Times it touched another car.
+    /// Collisions: the car touched another car.
     pub collisions: u32,
-    /// Times it turned round.
+    /// Spins.
     pub spins: u32,
-    /// All of these, in order.
+    /// All mishaps, in order.
     pub mishaps: Vec<Mishap>,
-    /// Estimate against truth, at the scans' stamps, the first 2 s left out; None when nothing was estimated.
+    /// Errors of the estimate at the stamps of the scans, without the first 2 s; None without an estimate.
     pub pose_error: Option<Summaries>,
     /// Mean scan alignment by the localizer's own definition (0.10 m), in [0, 1]; None where there is no localizer.
     pub alignment: Option<f64>,
     /// Share of the updates in each health state; empty where there is no localizer.
     pub states: BTreeMap<State, f64>,
-    /// What the states were worth.
+    /// How often the states were right.
     pub state_truth: Option<StateTruth>,
-    /// Times the localizer gave its pose up and searched the map.
+    /// Searches of the map: the localizer gave its pose up.
     pub searches: usize,
-    /// How long the race took [s].
+    /// Duration of the race [s].
     pub race_s: f64,
-    /// Measured on this machine: differs from run to run.
+    /// Load on this machine; differs from run to run.
     pub load: LoadSummary,
 }
 
-/// All cars of all seeds together.
+/// The summary of all cars of all seeds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RaceSummary {
     /// Cars that drove all their laps.
@@ -121,21 +121,21 @@ pub struct RaceSummary {
     pub line_error_m: Option<MeanSigma>,
     /// Per lap: mean distance of the car from the raceline [m].
     pub true_line_error_m: Option<MeanSigma>,
-    /// Root mean square of the position's error [m], over cars of equal weight.
+    /// Root mean square of the position error over the cars [m].
     pub position_rmse_m: Option<f64>,
-    /// Largest error of the position [m].
+    /// Largest position error [m].
     pub position_max_m: Option<f64>,
-    /// Root mean square of the heading's error [rad].
+    /// Root mean square of the heading error [rad].
     pub heading_rmse_rad: Option<f64>,
     /// Scan alignment by the paper's definition, in [0, 1].
     pub alignment_paper: Option<f64>,
-    /// Scan alignment by ours, in [0, 1].
+    /// Scan alignment by the localizer's own definition, in [0, 1].
     pub alignment: Option<f64>,
     /// Share of the updates in each health state; empty where there is no localizer.
     pub states: BTreeMap<State, f64>,
-    /// Updates of all cars that were LOST though within 0.2 m and 2 deg of the truth.
+    /// Updates of all cars in state LOST within 0.2 m and 2 deg of the truth.
     pub false_lost: usize,
-    /// Updates of all cars that were LOCALIZED though further off than 1 m.
+    /// Updates of all cars in state LOCALIZED more than 1 m from the truth.
     pub false_localized: usize,
     /// Searches of the map by all cars.
     pub searches: usize,
@@ -143,7 +143,7 @@ pub struct RaceSummary {
     pub crashes: u32,
     /// Scrapes of all cars.
     pub scrapes: u32,
-    /// Collisions of all cars; a pair that touches counts twice.
+    /// Collisions of all cars; each counts for both cars.
     pub collisions: u32,
     /// Spins of all cars.
     pub spins: u32,
@@ -152,7 +152,7 @@ pub struct RaceSummary {
 }
 
 impl RaceSummary {
-    /// Sums up any number of cars.
+    /// Summarizes any number of cars.
     pub fn of(cars: &[CarResult]) -> Self {
         let laps: Vec<LapRecord> = cars.iter().flat_map(|car| car.laps.iter().copied()).collect();
         let over_laps = |value: fn(&LapRecord) -> f64| laps.iter().map(value).collect::<Vec<_>>();
@@ -203,19 +203,19 @@ impl RaceSummary {
     }
 }
 
-/// Takes notes of one car.
-pub(super) struct Recorder {
+/// The measurements of one car during a race.
+pub(super) struct CarMeasurements {
     track: Arc<Track>,
     map: Arc<TrackMap>,
     finished: Vec<LapRecord>,
     mishaps: Vec<Mishap>,
-    /// How far off the estimate was at the last scan [m].
+    /// Error of the estimate at the last scan [m].
     pose_error: Option<f64>,
-    /// Past the start line for the first time; the way there belongs to no lap.
+    /// True once the car has crossed the start line. The way there belongs to no lap.
     pub(super) on_a_lap: bool,
     pose_errors: PoseErrors,
     states: States,
-    /// Of the lap being driven: distances of estimate and car from the line, alignments.
+    /// Of the lap being driven: distances of the estimate and of the car from the raceline.
     line_errors: Vec<f64>,
     true_line_errors: Vec<f64>,
     alignments_paper: Vec<f64>,
@@ -224,7 +224,7 @@ pub(super) struct Recorder {
     busy: Duration,
 }
 
-impl Recorder {
+impl CarMeasurements {
     pub(super) fn new(track: Arc<Track>, map: Arc<TrackMap>) -> Self {
         Self {
             track,
@@ -248,7 +248,7 @@ impl Recorder {
         self.finished.len()
     }
 
-    /// Notes the time that part of the localizer takes.
+    /// Measures the time of a part of an update.
     pub(super) fn timed<T>(&mut self, work: impl FnOnce() -> T) -> T {
         let begin = Instant::now();
         let result = work();
@@ -256,7 +256,7 @@ impl Recorder {
         result
     }
 
-    /// Notes the time that a whole update takes.
+    /// Measures the time of a whole update.
     pub(super) fn timed_update<T>(&mut self, work: impl FnOnce() -> T) -> T {
         let before = self.busy;
         let result = self.timed(work);
@@ -265,7 +265,7 @@ impl Recorder {
         result
     }
 
-    /// The driver was given `estimate`, and the car was `true_d` [m] from the line.
+    /// The driver got `estimate`, and the car was `true_d` [m] from the raceline.
     pub(super) fn driven(&mut self, estimate: Pose, true_d: f64) {
         if !self.on_a_lap {
             return;
@@ -275,7 +275,7 @@ impl Recorder {
         self.true_line_errors.push(true_d.abs());
     }
 
-    /// A scan was taken in; the estimate and the truth are those at its stamp.
+    /// A scan led to `estimate`. Estimate and truth are those at its stamp.
     pub(super) fn scanned(
         &mut self,
         scan: &Scan,
@@ -300,12 +300,12 @@ impl Recorder {
         self.alignments.extend(alignment);
     }
 
-    /// What the health state said of the estimate at a scan's stamp.
+    /// The health state of the estimate at a scan's stamp.
     pub(super) fn judged(&mut self, stamp: Stamp, state: State, estimate: Pose, truth: Option<Pose>) {
         self.states.push(stamp, state, estimate, truth);
     }
 
-    /// Something went wrong; how far off the estimate was is added.
+    /// Records a mishap, and adds the error of the estimate.
     pub(super) fn mishap(&mut self, mishap: Mishap) {
         self.mishaps.push(Mishap {
             pose_error_m: self.pose_error,
@@ -313,7 +313,7 @@ impl Recorder {
         });
     }
 
-    /// A lap is over.
+    /// A lap ended.
     pub(super) fn lap(&mut self, time: Duration) {
         let mut taken =
             |values: fn(&mut Self) -> &mut Vec<f64>| mean(&std::mem::take(values(self))).unwrap_or_default();

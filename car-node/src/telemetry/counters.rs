@@ -1,4 +1,4 @@
-//! What the load meter reads: counts and durations that the other threads leave behind.
+//! Counters: numbers and durations that the threads of a node record for the load meter.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -31,9 +31,9 @@ impl Spread {
     }
 }
 
-/// What has come in since the meter last looked.
+/// Recorded since the meter last read.
 #[derive(Debug, Default)]
-struct Window {
+struct MeterInterval {
     update_times: Vec<f64>,
     scan_ages: Vec<f64>,
     publish_lags: Vec<f64>,
@@ -43,20 +43,20 @@ struct Window {
     dropped: BTreeMap<Dropped, u64>,
 }
 
-/// What one look at the counters says.
+/// The counters as the meter reads them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reading {
     /// Time of a whole update.
     pub update_time: Spread,
     /// Age of a scan when it reached the filter.
     pub scan_age: Spread,
-    /// From a pose leaving the filter to the network having taken it.
+    /// From the time of a pose to its hand-over to the network.
     pub publish_lag: Spread,
-    /// Scans since the last look.
+    /// Scans since the last reading.
     pub scans: usize,
-    /// Odometry messages since the last look.
+    /// Odometry messages since the last reading.
     pub odometry: usize,
-    /// Updates since the last look.
+    /// Updates since the last reading.
     pub updates: usize,
     /// Standard deviation of the time between scans [s].
     pub scan_jitter: f64,
@@ -66,53 +66,53 @@ pub struct Reading {
     pub dropped: BTreeMap<Dropped, u64>,
     /// Dropped since the start because the filter was too slow.
     pub overrun: u64,
-    /// Payloads from the network that could not be read, since the start.
+    /// Payloads from the network that did not decode, since the start.
     pub payloads: u64,
 }
 
-/// SharedState by all threads of a node. Every call is short.
+/// Shared by all threads of a node. Every call is short.
 #[derive(Debug, Default)]
 pub struct Counters {
-    window: Mutex<Window>,
+    interval: Mutex<MeterInterval>,
     queued: AtomicUsize,
     overrun: AtomicU64,
     payloads: AtomicU64,
 }
 
-/// More than a second of anything; a meter that has stopped must not cost memory.
+/// At most this many values per interval: more than a second of anything. So a meter that has stopped costs no memory.
 const MOST: usize = 4096;
 
 impl Counters {
-    fn with(&self, change: impl FnOnce(&mut Window)) {
-        change(&mut self.window.lock().unwrap_or_else(PoisonError::into_inner));
+    fn with(&self, change: impl FnOnce(&mut MeterInterval)) {
+        change(&mut self.interval.lock().unwrap_or_else(PoisonError::into_inner));
     }
 
-    /// A message has reached the filter, `age` [s] after its stamp, at `now` [s], with `queued` more waiting.
+    /// A message reached the filter at `now` [s], `age` [s] after its stamp. `queued` more are waiting.
     pub fn arrived(&self, event: &SensorEvent, age: f64, now: f64, queued: usize) {
         self.queued.store(queued, Ordering::Relaxed);
-        self.with(|window| match event {
+        self.with(|interval| match event {
             SensorEvent::Scan(_) => {
-                push(&mut window.scans, now);
-                push(&mut window.scan_ages, age);
+                push(&mut interval.scans, now);
+                push(&mut interval.scan_ages, age);
             }
-            SensorEvent::Odometry(_) => window.odometry += 1,
+            SensorEvent::Odometry(_) => interval.odometry += 1,
             SensorEvent::YawRate(_) => {}
         });
     }
 
-    /// The filter has refused a message.
+    /// The localizer refused a message.
     pub fn dropped(&self, cause: Dropped) {
-        self.with(|window| *window.dropped.entry(cause).or_default() += 1);
+        self.with(|interval| *interval.dropped.entry(cause).or_default() += 1);
     }
 
     /// A whole update took this long [s].
     pub fn updated(&self, time: f64) {
-        self.with(|window| push(&mut window.update_times, time));
+        self.with(|interval| push(&mut interval.update_times, time));
     }
 
-    /// A pose was given to the network this long after it left the filter [s].
+    /// A pose was handed to the network this long after its time [s].
     pub fn published(&self, lag: f64) {
-        self.with(|window| push(&mut window.publish_lags, lag));
+        self.with(|interval| push(&mut interval.publish_lags, lag));
     }
 
     /// A message was dropped because the filter was too slow.
@@ -120,30 +120,30 @@ impl Counters {
         self.overrun.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// A payload from the network could not be read. Returns how many before it.
+    /// A payload from the network did not decode. Returns the number of those before it.
     pub fn bad_payload(&self) -> u64 {
         self.payloads.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Reads everything, and begins a new window.
+    /// Reads the counters, and starts a new interval.
     pub fn read(&self) -> Reading {
-        let mut window = self.window.lock().unwrap_or_else(PoisonError::into_inner);
-        let fresh = Window {
-            dropped: window.dropped.clone(),
-            ..Window::default()
+        let mut interval = self.interval.lock().unwrap_or_else(PoisonError::into_inner);
+        let fresh = MeterInterval {
+            dropped: interval.dropped.clone(),
+            ..MeterInterval::default()
         };
-        let window = std::mem::replace(&mut *window, fresh);
-        let gaps: Vec<f64> = window.scans.windows(2).map(|pair| pair[1] - pair[0]).collect();
+        let interval = std::mem::replace(&mut *interval, fresh);
+        let gaps: Vec<f64> = interval.scans.windows(2).map(|pair| pair[1] - pair[0]).collect();
         Reading {
-            update_time: Spread::of(&window.update_times),
-            scan_age: Spread::of(&window.scan_ages),
-            publish_lag: Spread::of(&window.publish_lags),
-            scans: window.scans.len(),
-            odometry: window.odometry,
-            updates: window.update_times.len(),
+            update_time: Spread::of(&interval.update_times),
+            scan_age: Spread::of(&interval.scan_ages),
+            publish_lag: Spread::of(&interval.publish_lags),
+            scans: interval.scans.len(),
+            odometry: interval.odometry,
+            updates: interval.update_times.len(),
             scan_jitter: MeanSigma::of(&gaps).map_or(0.0, |gap| gap.sigma),
             queued: self.queued.load(Ordering::Relaxed),
-            dropped: window.dropped,
+            dropped: interval.dropped,
             overrun: self.overrun.load(Ordering::Relaxed),
             payloads: self.payloads.load(Ordering::Relaxed),
         }
@@ -162,7 +162,7 @@ mod tests {
     use synpf::{Odometry, Stamp, Twist};
 
     #[test]
-    fn windows_begin_anew_and_drops_add_up() {
+    fn intervals_start_at_zero_and_drops_add_up() {
         let counters = Counters::default();
         let odometry = SensorEvent::Odometry(Odometry {
             stamp: Stamp(0),

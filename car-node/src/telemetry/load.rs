@@ -1,4 +1,4 @@
-//! What the localizer costs the car: once a second, from the operating system and the node's own counters.
+//! The load of the car, once a second: from the operating system and the node's own counters.
 
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -25,7 +25,7 @@ pub fn start(shared: Arc<SharedState>, stop: Receiver<()>) -> std::io::Result<Jo
     })
 }
 
-/// Reads the machine.
+/// Reads the load of the machine.
 struct Meter {
     system: System,
     components: Components,
@@ -41,7 +41,7 @@ impl Meter {
             pid: sysinfo::get_current_pid().ok(),
             last: Instant::now(),
         };
-        // Use of the CPU is a difference: the first look gives the point to count from.
+        // CPU usage is a difference: the first reading is its reference.
         meter.refresh();
         meter
     }
@@ -114,8 +114,8 @@ fn drops(reading: &Reading, telemetry: u64) -> Drops {
     }
 }
 
-/// Whether a Raspberry Pi slows itself down (bits 1 to 3 of what its firmware reports: capped frequency,
-/// throttled, soft temperature limit). Other machines do not tell.
+/// True when a Raspberry Pi is throttled: bits 1 to 3 of its firmware's report (capped frequency, throttled, soft temperature
+/// limit). None on other machines.
 fn throttled() -> Option<bool> {
     let text = std::fs::read_to_string("/sys/devices/platform/soc/soc:firmware/get_throttled").ok()?;
     let bits = u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok()?;
@@ -128,7 +128,7 @@ mod tests {
     use crate::telemetry::shared_state::SharedState;
 
     #[test]
-    fn a_busy_second_is_seen() {
+    fn a_busy_process_has_a_load() {
         let shared = SharedState::default();
         let mut meter = Meter::new();
         let until = Instant::now() + Duration::from_millis(400);
@@ -137,7 +137,7 @@ mod tests {
         }
         shared.counters.dropped(Dropped::NoBeams);
         let load = meter.read(&shared);
-        // How much of the CPU this gets depends on who else is there; some it does.
+        // The share of the CPU depends on what else runs.
         assert!(load.cpu_process > 0.0, "{load:?}");
         assert!(load.memory_process > 0 && load.memory_total >= load.memory_used);
         assert!(!load.cpu_cores.is_empty());

@@ -1,4 +1,4 @@
-//! What the car sends: the queue, the publisher, what is kept to be sent again, and the load.
+//! What the car sends: queue, publisher, replay buffer, throttle and load.
 
 pub mod counters;
 pub mod load;

@@ -1,4 +1,4 @@
-//! The telemetry thread: takes what the others have left, and sends it. A slow network slows down nobody else.
+//! The publisher: the thread that sends what the other threads queue. A slow network blocks none of them.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,7 +17,7 @@ use crate::telemetry::replay_buffer::ReplayBuffer;
 use crate::telemetry::shared_state::SharedState;
 use crate::wire;
 
-/// Everything that goes out.
+/// The topics that are published.
 pub const TOPICS: [Topic; 13] = [
     Topic::Pose,
     Topic::Cloud,
@@ -34,12 +34,12 @@ pub const TOPICS: [Topic; 13] = [
     Topic::RecordedTruth,
 ];
 
-/// Looks for a stop at least this often.
+/// The stop signal is checked at least this often.
 const TICK: Duration = Duration::from_millis(50);
 
-/// One topic's way out, and how many messages have taken it.
+/// The zenoh publisher of a topic, and the sequence number of its last message.
 struct TopicPublisher {
-    outlet: zenoh::pubsub::Publisher<'static>,
+    publisher: zenoh::pubsub::Publisher<'static>,
     sequence: u64,
 }
 
@@ -54,7 +54,7 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Declares every topic on `session`. `run_id` tells this run of the node from others.
+    /// Declares every topic on `session`. `run_id` identifies this run of the node.
     pub fn new(
         session: &Session,
         car: &CarName,
@@ -66,8 +66,14 @@ impl Publisher {
         let streams = TOPICS
             .into_iter()
             .map(|topic| {
-                let outlet = network::declare_publisher(session, car, topic)?;
-                Ok((topic, TopicPublisher { outlet, sequence: 0 }))
+                let publisher = network::declare_publisher(session, car, topic)?;
+                Ok((
+                    topic,
+                    TopicPublisher {
+                        publisher,
+                        sequence: 0,
+                    },
+                ))
             })
             .collect::<Result<_, NetworkError>>()?;
         Ok(Self {
@@ -80,7 +86,7 @@ impl Publisher {
         })
     }
 
-    /// Starts the thread. Once `stop` is dropped it sends what is left, and ends.
+    /// Starts the thread. When `stop` is dropped, it sends what is queued and ends.
     pub fn start(mut self, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
         thread::Builder::new().name("publisher".into()).spawn(move || {
             while stop.try_recv() == Err(TryRecvError::Empty) {
@@ -91,7 +97,7 @@ impl Publisher {
         })
     }
 
-    /// Sends all that is there, the pose first.
+    /// Sends everything that is queued, the pose first.
     fn flush(&mut self) {
         let shared = Arc::clone(&self.shared);
         if let Some(pose) = shared.telemetry.take_pose() {
@@ -169,7 +175,8 @@ impl Publisher {
         }
     }
 
-    /// Sends a message. One of a stream that must be whole is kept, too, and while the link is too slow for it, only kept.
+    /// Sends a message. If its stream must be complete, the message is also kept. While the link is too slow, messages for the
+    /// recorder are only kept.
     fn send<M: Message>(&mut self, topic: Topic, sensor: Stamp, message: &M) {
         let Some(stream) = self.streams.get_mut(&topic) else {
             return;
@@ -196,14 +203,18 @@ impl Publisher {
                         return Ok(());
                     }
                 }
-                stream.outlet.put(bytes).wait().map_err(|error| error.to_string())
+                stream
+                    .publisher
+                    .put(bytes)
+                    .wait()
+                    .map_err(|error| error.to_string())
             });
         if let Err(error) = sent {
             let failed = self.failed.entry(topic).or_default();
             *failed += 1;
-            // Once, and then at every power of two: a fault at 40 Hz must not fill the disk.
+            // Logged at every power of two only, so that a fault at 40 Hz does not fill the disk.
             if failed.is_power_of_two() {
-                tracing::warn!(%topic, failed, error, "a message did not go out");
+                tracing::warn!(%topic, failed, error, "a message was not sent");
             }
         }
     }

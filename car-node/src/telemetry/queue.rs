@@ -1,4 +1,4 @@
-//! What the filter leaves for the publisher to pick up. Leaving something never waits.
+//! The queue from the other threads to the publisher. Adding to it never blocks.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -13,10 +13,10 @@ use synpf::{Odometry, Scan, Stamp, Twist, WeightedPose};
 use crate::health::{Proposal, Verdict};
 use crate::sensors::TrueMotion;
 
-/// Where the car is. Stamps here are on the sensors' clock.
+/// A pose with what belongs to it. Stamps in this file are on the sensors' clock.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseReport {
-    /// When the pose is true.
+    /// The time at which the pose is true.
     pub stamp: Stamp,
     /// `map_from_base_link`.
     pub pose: Pose,
@@ -28,18 +28,18 @@ pub struct PoseReport {
     pub track: Option<[f64; 2]>,
     /// Laps begun.
     pub lap: u32,
-    /// The update that it comes from.
+    /// The update that it is from.
     pub update: u64,
-    /// Carried forward by odometry since that update.
+    /// True when odometry has moved it since that update.
     pub predicted: bool,
 }
 
-/// The particles, or as many of them as are sent.
+/// The particle cloud, thinned out for sending.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CloudSample {
-    /// When it is true.
+    /// The time at which it is true.
     pub stamp: Stamp,
-    /// The update that it comes from.
+    /// The update that it is from.
     pub update: u64,
     /// The estimate.
     pub centre: Pose,
@@ -51,11 +51,11 @@ pub struct CloudSample {
     pub spread: [f64; 2],
     /// Second mode over the first.
     pub second_mode: f64,
-    /// Some of them.
+    /// The particles to send.
     pub particles: Vec<WeightedPose>,
 }
 
-/// How a reading compares with the map.
+/// A beam compared with the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BeamClass {
     /// It ends at a wall.
@@ -71,7 +71,7 @@ pub enum BeamClass {
 /// End points of a scan at the estimate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScanPoints {
-    /// When the scan began.
+    /// Time of the first beam.
     pub stamp: Stamp,
     /// The update that it led to.
     pub update: u64,
@@ -81,46 +81,46 @@ pub struct ScanPoints {
     pub points: Vec<([f64; 2], BeamClass)>,
 }
 
-/// Health as it goes out.
+/// A health verdict with the recommended set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HealthReport {
-    /// When it was looked at.
+    /// Time of the verdict.
     pub stamp: Stamp,
     /// The verdict.
     pub verdict: Verdict,
-    /// The set that the car would rather use.
+    /// The set that the car recommends.
     pub proposal: Option<Proposal>,
-    /// The car switches sets by itself.
+    /// True when the car switches sets by itself.
     pub auto: bool,
 }
 
-/// Something that happened.
+/// An event.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EventPayload {
-    /// When, on the sensors' clock.
+    /// Time of the event.
     pub stamp: Stamp,
     /// The last update before it.
     pub update: u64,
-    /// Who caused it.
+    /// Who caused it: an operator, or where a pose came from.
     pub who: Option<String>,
     /// The command that caused it.
     pub command: Option<protocol::CommandId>,
-    /// What.
+    /// What happened.
     pub kind: EventKind,
 }
 
-/// What must all go out, in order.
+/// Messages that must be sent in order.
 #[derive(Debug)]
 pub enum Record {
     /// A pose, for the recorder.
     Pose(PoseReport),
-    /// Health, for the wall and, at full rate, for the recorder.
+    /// Health, for the pit wall and, at full rate, for the recorder.
     Health {
-        /// What.
+        /// The report.
         report: HealthReport,
-        /// For the pit wall's display.
+        /// True to send it for display.
         live: bool,
-        /// For the recorder.
+        /// True to send it for the recorder.
         recorded: bool,
     },
     /// Odometry, for the recorder.
@@ -131,7 +131,7 @@ pub enum Record {
     Truth(TrueMotion),
     /// The set in force.
     Params(Box<protocol::Params>),
-    /// The set in the shadow and how it compares.
+    /// The shadow set, compared with the set in force.
     Shadow(Box<protocol::Shadow>),
     /// Load of the last second.
     Load(Box<protocol::Load>),
@@ -139,7 +139,7 @@ pub enum Record {
     Event(EventPayload),
 }
 
-/// A place for one value: a newer one takes its place.
+/// Holds the newest value.
 #[derive(Debug)]
 pub struct Slot<T>(Mutex<Option<T>>);
 
@@ -159,16 +159,17 @@ impl<T> Slot<T> {
         replaced.is_some()
     }
 
-    /// Takes the value out.
+    /// Takes the value.
     pub fn take(&self) -> Option<T> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 }
 
-/// Records that wait for the publisher: half a second of all streams of a car at full rate.
+/// Records in the queue: half a second of all streams at full rate.
 const QUEUE: usize = 256;
 
-/// A queue from the filter, the command server and the load meter to the publisher.
+/// The queue from the filter, the command server and the load meter to the publisher. Of poses, clouds and scans it keeps the
+/// newest only.
 #[derive(Debug)]
 pub struct TelemetryQueue {
     pose: Slot<PoseReport>,
@@ -193,55 +194,55 @@ impl Default for TelemetryQueue {
 }
 
 impl TelemetryQueue {
-    /// Leaves the latest pose.
+    /// Sets the newest pose.
     pub fn pose(&self, pose: PoseReport) {
         let replaced = self.pose.put(pose);
         self.count(replaced);
         self.wake();
     }
 
-    /// Leaves the latest cloud.
+    /// Sets the newest cloud.
     pub fn cloud(&self, cloud: CloudSample) {
         let replaced = self.cloud.put(cloud);
         self.count(replaced);
         self.wake();
     }
 
-    /// Leaves the latest scan view.
+    /// Sets the newest scan view.
     pub fn scan(&self, scan: ScanPoints) {
         let replaced = self.scan.put(scan);
         self.count(replaced);
         self.wake();
     }
 
-    /// Leaves a record; a full queue drops it, which is counted.
+    /// Adds a record. A full queue drops it and counts it.
     pub fn record(&self, record: Record) {
         self.count(self.queue.0.try_send(record).is_err());
         self.wake();
     }
 
-    /// What was dropped because the publisher was too slow.
+    /// How much was dropped because the publisher was too slow.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
 
-    /// Waits until something may be there.
+    /// Waits until something was added, or for `at_most`.
     pub fn wait(&self, at_most: Duration) {
-        // An error is a timeout, which is as good: the caller looks either way.
+        // An error is a timeout: the caller checks the queue in any case.
         self.wake.1.recv_timeout(at_most).ok();
     }
 
-    /// The latest pose, unless it was taken.
+    /// The newest pose, unless it was taken.
     pub fn take_pose(&self) -> Option<PoseReport> {
         self.pose.take()
     }
 
-    /// The latest cloud, unless it was taken.
+    /// The newest cloud, unless it was taken.
     pub fn take_cloud(&self) -> Option<CloudSample> {
         self.cloud.take()
     }
 
-    /// The latest scan view, unless it was taken.
+    /// The newest scan view, unless it was taken.
     pub fn take_scan(&self) -> Option<ScanPoints> {
         self.scan.take()
     }
@@ -258,7 +259,7 @@ impl TelemetryQueue {
     }
 
     fn wake(&self) {
-        // Full means that a wake-up is already on its way.
+        // Full means that the publisher is being woken already.
         self.wake.0.try_send(()).ok();
     }
 }
@@ -291,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_publisher_that_sleeps_costs_records_and_no_time() {
+    fn a_slow_publisher_drops_records_and_blocks_nobody() {
         let telemetry = TelemetryQueue::default();
         for update in 0..QUEUE as u64 + 10 {
             telemetry.record(Record::Pose(pose(update)));

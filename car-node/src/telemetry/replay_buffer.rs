@@ -1,21 +1,20 @@
-//! What was sent, for those who did not get it. Pure: no network, no clock.
+//! The replay buffer: what was sent, for receivers that missed it. Pure: no network, no clock.
 //!
-//! A stream that must be whole is kept here while it is sent, message by message under its number. A pit wall that lacks
-//! some asks for them ([`MissingRequest`]) in pieces, at its own pace.
+//! Messages of a stream that must be complete are kept here by their sequence numbers. A pit wall that misses some requests
+//! them ([`MissingRequest`]) in pieces, at its own pace.
 
 use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{Kept, MissingReply, MissingRequest, Resent, Topic};
 
-/// How much is kept of each stream [bytes]: at the full rate of a car with 1081 beams, some four minutes of scans, and of the
-/// others far more.
+/// Size of each stream's buffer [bytes]: four minutes of scans of 1081 beams at full rate, and far more of the others.
 const MOST: usize = 24 * 1024 * 1024;
 
 /// Messages by stream and number.
 #[derive(Debug, Default)]
 pub struct ReplayBuffer(BTreeMap<Topic, StreamBuffer>);
 
-/// One stream. Its numbers have no holes.
+/// The messages of one stream, without gaps in their numbers.
 #[derive(Debug, Default)]
 struct StreamBuffer {
     /// Number of the oldest message.
@@ -25,7 +24,7 @@ struct StreamBuffer {
 }
 
 impl ReplayBuffer {
-    /// Keeps a message. What came before it and has no room any more goes.
+    /// Keeps a message. The oldest ones are dropped when the buffer is full.
     pub fn keep(&mut self, topic: Topic, sequence: u64, bytes: Vec<u8>) {
         let stream = self.0.entry(topic).or_default();
         if sequence != stream.first + stream.messages.len() as u64 {
@@ -37,13 +36,13 @@ impl ReplayBuffer {
         stream.bytes += bytes.len();
         stream.messages.push_back(bytes);
         while stream.bytes > MOST && stream.messages.len() > 1 {
-            let gone = stream.messages.pop_front().map_or(0, |oldest| oldest.len());
-            stream.bytes -= gone;
+            let dropped = stream.messages.pop_front().map_or(0, |oldest| oldest.len());
+            stream.bytes -= dropped;
             stream.first += 1;
         }
     }
 
-    /// What there is of what is missing, as much of it as the budget allows. `run_id` is this run of the node.
+    /// The requested messages that are kept, as many as the budget allows. `run_id` is this run of the node.
     pub fn find(&self, run_id: u64, request: &MissingRequest) -> MissingReply {
         let streams = self.0.iter().map(|(topic, stream)| Kept {
             topic: *topic,
@@ -95,15 +94,15 @@ mod tests {
 
     const RUN: u64 = 7;
 
-    fn archive(numbers: std::ops::RangeInclusive<u64>, len: usize) -> ReplayBuffer {
-        let mut archive = ReplayBuffer::default();
+    fn buffer(numbers: std::ops::RangeInclusive<u64>, len: usize) -> ReplayBuffer {
+        let mut buffer = ReplayBuffer::default();
         for number in numbers {
-            archive.keep(Topic::Event, number, vec![number as u8; len]);
+            buffer.keep(Topic::Event, number, vec![number as u8; len]);
         }
-        archive
+        buffer
     }
 
-    fn ask(archive: &ReplayBuffer, run_id: u64, ranges: &[[u64; 2]], budget: u32) -> MissingReply {
+    fn request(buffer: &ReplayBuffer, run_id: u64, ranges: &[[u64; 2]], budget: u32) -> MissingReply {
         let request = MissingRequest {
             run_id,
             streams: vec![Wanted {
@@ -112,7 +111,7 @@ mod tests {
             }],
             budget,
         };
-        archive.find(RUN, &request)
+        buffer.find(RUN, &request)
     }
 
     fn numbers(reply: &MissingReply) -> Vec<u8> {
@@ -120,9 +119,9 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_comes_in_order_and_within_the_budget() {
-        let archive = archive(1..=9, 100);
-        let reply = ask(&archive, RUN, &[[2, 3], [6, 20]], 1000);
+    fn missing_messages_come_in_order_and_within_the_budget() {
+        let buffer = buffer(1..=9, 100);
+        let reply = request(&buffer, RUN, &[[2, 3], [6, 20]], 1000);
         assert_eq!(numbers(&reply), [2, 3, 6, 7, 8, 9]);
         let kept = Kept {
             topic: Topic::Event,
@@ -130,33 +129,36 @@ mod tests {
             last: 9,
         };
         assert_eq!(reply.streams, [kept]);
-        assert_eq!(numbers(&ask(&archive, RUN, &[[2, 3], [6, 20]], 399)), [2, 3, 6]);
         assert_eq!(
-            numbers(&ask(&archive, RUN, &[[4, 9]], 0)),
+            numbers(&request(&buffer, RUN, &[[2, 3], [6, 20]], 399)),
+            [2, 3, 6]
+        );
+        assert_eq!(
+            numbers(&request(&buffer, RUN, &[[4, 9]], 0)),
             [4],
-            "one comes in any case"
+            "at least one is sent"
         );
     }
 
     #[test]
-    fn absurd_questions_are_answered_with_what_there_is() {
-        let archive = archive(5..=6, 1);
+    fn absurd_requests_get_what_is_kept() {
+        let buffer = buffer(5..=6, 1);
         for ranges in [[0, u64::MAX], [0, 5], [6, 6], [7, u64::MAX], [0, 4]] {
             let expected: Vec<u8> = (5..=6)
                 .filter(|n| (ranges[0]..=ranges[1]).contains(n))
                 .map(|n| n as u8)
                 .collect();
-            assert_eq!(numbers(&ask(&archive, RUN, &[ranges], u32::MAX)), expected);
+            assert_eq!(numbers(&request(&buffer, RUN, &[ranges], u32::MAX)), expected);
         }
-        let other = ask(&archive, RUN + 1, &[[0, 9]], u32::MAX);
+        let other = request(&buffer, RUN + 1, &[[0, 9]], u32::MAX);
         assert_eq!(other.messages, [], "numbers of another run of the node");
         assert_eq!((other.streams[0].first, other.streams[0].last), (5, 6));
     }
 
     #[test]
-    fn the_oldest_go_when_it_is_full() {
-        let archive = archive(1..=30, 1 << 20);
-        let reply = ask(&archive, RUN, &[[1, 30]], 0);
+    fn the_oldest_are_dropped_when_it_is_full() {
+        let buffer = buffer(1..=30, 1 << 20);
+        let reply = request(&buffer, RUN, &[[1, 30]], 0);
         assert_eq!((reply.streams[0].first, reply.streams[0].last), (7, 30));
         assert_eq!(numbers(&reply), [7]);
     }

@@ -1,4 +1,4 @@
-//! What the threads of a car share. Nobody waits for anybody here: every lock is held for microseconds.
+//! The state that the threads of a car share. Every lock is held for microseconds.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -14,11 +14,11 @@ use crate::telemetry::throttle::Throttle;
 /// The state that the filter, the command server, the publisher and the load meter share.
 #[derive(Debug)]
 pub struct SharedState {
-    /// What goes out.
+    /// Messages for the publisher.
     pub telemetry: TelemetryQueue,
-    /// What the load meter reads.
+    /// Counters for the load meter.
     pub counters: Arc<Counters>,
-    /// How often each topic is sent, as the operator wants it.
+    /// How often each topic is sent, as requested by the operator.
     pub rates: Mutex<Rates>,
     /// The set that the car proposes, and whether it may switch by itself.
     pub advice: Mutex<Advice>,

@@ -1,29 +1,29 @@
-//! Sends less while the link is slow: what cannot get through in time only delays the rest. Pure: the caller brings the
-//! time.
+//! The throttle: lowers the rates while the link is slow, because what arrives late delays everything else. Pure: the caller
+//! gives the time.
 
 use std::collections::VecDeque;
 
 use protocol::{LinkReport, Rates};
 use synpf::Stamp;
 
-/// Poses that arrive later than this mean a slow link [s]...
+/// The link is slow when poses arrive later than this [s].
 const SLOW: f64 = 0.25;
-/// ...once that has lasted [s].
+/// Rates are lowered when the link was slow for this long [s].
 const SLOW_FOR: f64 = 2.0;
-/// Where sending less has not helped for so long, the full-rate streams for the recorder stay on the car, too [s]: over a
-/// link that cannot take them, they only keep what is live from coming through. The pit wall asks for them as it can.
+/// When lower rates have not helped for this long, the full-rate streams for the recorder stay on the car, too [s]. The pit
+/// wall requests them later, at the pace of the link.
 const STILL_SLOW_FOR: f64 = 3.0;
-/// Poses that arrive sooner than this mean that the link has recovered [s]...
+/// The link is fast when poses arrive sooner than this [s].
 const FAST: f64 = 0.1;
-/// ...once that has lasted [s]...
+/// Rates are restored when the link was fast for this long [s].
 const FAST_FOR: f64 = 5.0;
-/// ...or longer, up to this, where the link was slow again as soon as everything was sent [s].
+/// That time doubles, up to this, each time the link becomes slow again after the rates were restored [s].
 const FAST_FOR_AT_MOST: f64 = 80.0;
-/// Slow again so soon means that it is sending everything that makes the link slow [s].
+/// Slow again within this time means that the full rates are what slows the link [s].
 const AGAIN: f64 = 20.0;
-/// A report counts for this long [s].
+/// A report is valid for this long [s].
 const KEEP: f64 = 3.0;
-/// What is sent at most over a slow link.
+/// The highest rates on a slow link.
 const LOWERED: Rates = Rates {
     pose: 20.0,
     cloud: 2.0,
@@ -32,36 +32,36 @@ const LOWERED: Rates = Rates {
     recorded: true,
 };
 
-/// What has changed.
+/// A change of the rates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Change {
-    /// The car sends less from now on.
+    /// The rates are lowered.
     Lowered {
         /// From publishing a pose to its arrival [s].
         transit: f64,
-        /// What is sent at most.
+        /// The highest rates.
         rates: Rates,
     },
-    /// The car sends what it was asked for.
+    /// The requested rates are in force again.
     Restored,
 }
 
-/// Follows what pit walls say of the link.
+/// Judges the link by the reports of the pit walls.
 #[derive(Debug, Default)]
 pub struct Throttle {
-    /// The last reports of all pit walls: when, and how late poses arrive [s].
+    /// The last reports of all pit walls: time of the report, and how late poses arrive [s].
     reports: VecDeque<(Stamp, f64)>,
     slow_since: Option<Stamp>,
     fast_since: Option<Stamp>,
-    /// What is sent at most; None for all that was asked for.
+    /// The highest rates; None without a limit.
     lowered: Option<Rates>,
-    /// When everything was last sent again, and how long the link had to be fast for it [s].
+    /// When the rates were last restored, and how long the link had to be fast before [s].
     restored: Option<(Stamp, f64)>,
 }
 
 impl Throttle {
-    /// Takes in a report that came at `now`. Of several pit walls the one that is reached best counts: if even that one
-    /// is late, it is the car's own link that is slow.
+    /// Evaluates a report that came at `now`. Of several pit walls the one with the fastest link counts: if even that one is
+    /// late, the car's own link is slow.
     pub fn on_report(&mut self, now: Stamp, report: &LinkReport) -> Option<Change> {
         self.reports
             .push_back((now, f64::from(report.transit - report.uncertainty)));
@@ -112,7 +112,7 @@ impl Throttle {
         })
     }
 
-    /// What is sent when `wanted` was asked for.
+    /// The rates in force when `wanted` is requested.
     pub fn rates(&self, wanted: Rates) -> Rates {
         self.lowered.map_or(wanted, |most| Rates {
             pose: wanted.pose.min(most.pose),
@@ -123,7 +123,7 @@ impl Throttle {
         })
     }
 
-    /// True while the full-rate streams are kept and not sent, until somebody asks for them.
+    /// True while the full-rate streams are kept on the car until they are requested.
     pub fn parked(&self) -> bool {
         self.lowered.is_some_and(|most| !most.recorded)
     }
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
     use crate::telemetry::shared_state::DEFAULT_RATES;
 
-    /// A report a second for so long, from pit walls that are reached after these times [s].
+    /// Reports once a second for `seconds`, from pit walls with these transit times [s].
     fn report(throttle: &mut Throttle, from: u32, seconds: u32, transits: &[f32]) -> Vec<Change> {
         (from..from + seconds)
             .flat_map(|second| transits.iter().map(move |transit| (second, *transit)))
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_link_gets_less_until_it_has_recovered() {
+    fn a_slow_link_gets_lower_rates_until_it_recovers() {
         let mut throttle = Throttle::default();
         assert_eq!(report(&mut throttle, 0, 10, &[0.01]), []);
         assert_eq!(throttle.rates(DEFAULT_RATES), DEFAULT_RATES);
@@ -165,7 +165,7 @@ mod tests {
             (lowered.pose, lowered.cloud, lowered.recorded, throttle.parked()),
             (20.0, 2.0, true, true)
         );
-        // What was asked to be less stays less.
+        // A requested rate below the limit stays as it is.
         let quiet = Rates {
             pose: 5.0,
             ..DEFAULT_RATES
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_cannot_take_everything_is_tried_less_and_less_often() {
+    fn a_link_that_is_slow_at_full_rates_is_retried_at_growing_intervals() {
         let mut throttle = Throttle::default();
         let (mut now, mut tries) = (0, Vec::new());
         while now < 400 {
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hiccup_and_a_far_viewer_change_nothing() {
+    fn one_late_report_and_a_distant_pit_wall_change_nothing() {
         let mut throttle = Throttle::default();
         report(&mut throttle, 0, 3, &[0.01]);
         assert_eq!(report(&mut throttle, 3, 1, &[2.0]), []);

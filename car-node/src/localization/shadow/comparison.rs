@@ -41,15 +41,15 @@ impl ScanOutcome {
 
 /// The scans of the last seconds.
 #[derive(Debug, Default)]
-pub(super) struct Window {
+pub(super) struct ComparisonWindow {
     set: Option<SetRef>,
-    /// In force, and in the shadow.
+    /// Of the set in force, and of the shadow set.
     scans: VecDeque<[ScanOutcome; 2]>,
     skipped: VecDeque<(Stamp, u64)>,
 }
 
-impl Window {
-    /// Adds a scan. Under another set in force, the window begins anew.
+impl ComparisonWindow {
+    /// Adds a scan. The window is cleared when the set in force changes.
     pub(super) fn push(&mut self, set: &SetRef, force: ScanOutcome, shadow: ScanOutcome) {
         if self.set.as_ref() != Some(set) {
             self.set = Some(set.clone());
@@ -66,7 +66,7 @@ impl Window {
         }
     }
 
-    /// Scans that the shadow has left out before `stamp`.
+    /// Counts scans that the shadow skipped before `stamp`.
     pub(super) fn skip(&mut self, stamp: Stamp, count: u64) {
         if count > 0 {
             self.skipped.push_back((stamp, count));
@@ -149,7 +149,7 @@ mod tests {
 
     #[test]
     fn the_better_set_is_told_by_its_share_of_the_scans() {
-        let mut window = Window::default();
+        let mut window = ComparisonWindow::default();
         assert_eq!(window.comparison(), None);
         for i in 0..40 {
             // In force: better on every fourth, equal on every fourth, worse on half.
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn old_scans_and_another_set_are_forgotten() {
-        let mut window = Window::default();
+        let mut window = ComparisonWindow::default();
         for i in 0..600 {
             let [force, shadow] = scan(f64::from(i) / 40.0, [0.05; 2]);
             window.skip(force.stamp, u64::from(i % 40 == 20));

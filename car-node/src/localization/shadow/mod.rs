@@ -22,7 +22,7 @@ use protocol::EventKind;
 use synpf::{Localizer, Mode, Stamp};
 
 use self::budget::{Budget, ScanCost};
-use self::comparison::{ScanOutcome, Window};
+use self::comparison::{ComparisonWindow, ScanOutcome};
 use super::shadow_channel::{ShadowInput, ShadowReceiver, ShadowScan};
 use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::queue::Record;
@@ -79,7 +79,7 @@ struct RunningShadow {
     localizer: Box<dyn Localizer>,
     /// When it got its pose; None while it has none.
     initialized: Option<Stamp>,
-    window: Window,
+    window: ComparisonWindow,
     budget: Budget,
     /// Scans that the channel had dropped at the last scan.
     skipped: u64,
@@ -131,7 +131,7 @@ impl ShadowWorker {
                     name,
                     localizer,
                     initialized: None,
-                    window: Window::default(),
+                    window: ComparisonWindow::default(),
                     budget: Budget::default(),
                     skipped: self.receiver.skipped(),
                 });
@@ -223,7 +223,7 @@ impl RunningShadow {
         }
         if self.initialized.is_none() {
             self.localizer.initialize(force.pose).ok()?;
-            self.window = Window::default();
+            self.window = ComparisonWindow::default();
         }
         let initialized = *self.initialized.get_or_insert(force.stamp);
         let before = Instant::now();

@@ -3,16 +3,16 @@
 
 use std::path::PathBuf;
 
-use car_node::evaluate::{Fault, Start};
+use car_node::evaluate::Fault;
+use car_node::localization::Start;
 use car_node::network::endpoint;
-use car_node::node::Begin;
 use car_node::ros2::pose_publisher;
 use car_node::sensors::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
 
-/// The on-car node: localizes a 1:10 race car and publishes what it knows.
+/// The on-car node: localizes a 1:10 race car and publishes its pose and health.
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
 pub(crate) struct Cli {
@@ -24,22 +24,22 @@ pub(crate) struct Cli {
 /// What the node can do.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Run the car: sensors in, pose, particles, health and load out over zenoh, commands obeyed.
+    /// Run the car: read sensors, publish pose, particles, health and load over zenoh, execute commands.
     ///
     /// Ends with Ctrl-C, or when a bag has been played.
     Run(Run),
-    /// Run the filter over recorded bags as fast as it goes, and say how good it was.
+    /// Run the localizer over recorded bags as fast as it can, and report errors, consistency, health and times.
     ///
     /// Results go to stdout, progress to stderr. The same bag, set and seed give the same poses.
     Evaluate(Evaluate),
-    /// Say what each improvement over the reference brings: from synpf-baseline to a set, one row each.
+    /// Measure what each improvement over the reference contributes: from synpf-baseline to a set, one row each.
     ///
-    /// First each improvement on top of those before it, then the whole set without each.
+    /// First each improvement on top of the ones before, then the whole set without each of them.
     Ablate(Ablate),
-    /// Race simulated cars that drive on the filter's estimates, and hold the laps against the paper's.
+    /// Race simulated cars that drive on the localizer's estimates, and compare the laps with the paper's.
     ///
-    /// The same seed is the same race; only the load differs from run to run. The exit code is 0 when every car drove all its
-    /// laps without a crash, 3 when one did not, 1 when a file is at fault and 2 when the call is; with --table it is 0.
+    /// The same seed gives the same race; only the load differs from run to run. Exit code: 0 when every car drove all laps
+    /// without a crash, 3 when one did not, 1 for a faulty file, 2 for wrong usage. With --table it is 0.
     Race(Race),
     /// Make, check or draw a track.
     Track(Track),
@@ -52,11 +52,11 @@ pub(crate) enum SourceKind {
     Bag,
     /// A simulated car that races on a simulated track.
     Simulator,
-    /// Live sensors of a ROS 2 car, off rmw_zenoh's router or a zenoh-bridge-ros2dds.
+    /// Live sensors of a ROS 2 car, from rmw_zenoh's router or a zenoh-bridge-ros2dds.
     Ros2,
 }
 
-/// How well a simulated car's tyres hold.
+/// Grip of a simulated car's tyres.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Odometry {
     /// Clean tyres: 26 N of lateral pull.
@@ -80,13 +80,17 @@ pub(crate) struct Run {
     /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 0, 232))]
     pub(crate) ros_domain: Option<u32>,
-    /// With --source ros2: where to publish the pose for the car's own nodes (nav_msgs/Odometry in frame map).
+    /// With --source ros2: topic to publish the pose on for the car's own nodes (nav_msgs/Odometry in frame map).
     #[arg(long, value_name = "TOPIC", default_value = pose_publisher::TOPIC)]
     pub(crate) pose_topic: String,
+    /// With --source ros2: topic of initial poses (geometry_msgs/PoseWithCovarianceStamped in frame map) [default: /initialpose
+    /// in the namespace of the scan].
+    #[arg(long, value_name = "TOPIC")]
+    pub(crate) initial_pose_topic: Option<String>,
     /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
     #[arg(long, value_name = "MAP.yaml|TRACK")]
     pub(crate) map: PathBuf,
-    /// Raceline to measure progress along [default: raceline.csv beside the map, if there].
+    /// Raceline to measure progress along [default: raceline.csv beside the map, if it exists].
     #[arg(long, value_name = "FILE")]
     pub(crate) raceline: Option<PathBuf>,
     /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the one last in force, else hq].
@@ -94,15 +98,15 @@ pub(crate) struct Run {
     pub(crate) params: Option<String>,
     /// Pose of base_link in the map at the start [m, m, rad]; `truth` takes it from the source, `global` searches
     /// the map [default: truth for the simulator, else global].
-    #[arg(long, value_name = "X,Y,HEADING|truth|global", value_parser = begin, allow_hyphen_values = true)]
-    pub(crate) initial_pose: Option<Begin>,
+    #[arg(long, value_name = "X,Y,HEADING|truth|global", value_parser = start_or_global, allow_hyphen_values = true)]
+    pub(crate) initial_pose: Option<Start>,
     /// The car's name on the network.
     #[arg(long, value_name = "NAME", default_value = "car-1")]
     pub(crate) car: CarName,
     /// Play a bag this many times as fast, 0.01 to 1000.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = rate)]
     pub(crate) rate: f64,
-    /// Pit wall to dial, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or found by
+    /// Pit wall to connect to, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or one found by
     /// multicast].
     #[arg(long, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
@@ -112,10 +116,10 @@ pub(crate) struct Run {
     /// Do not publish the full-rate streams for the recorder (about 1 Mbit/s).
     #[arg(long)]
     pub(crate) no_recorded: bool,
-    /// Stay on the network when the bag has been played.
+    /// Stay on the network after the end of the bag.
     #[arg(long)]
     pub(crate) stay: bool,
-    /// Folder for sets that were put on the car [default: synpf/<car> in the user's state folder].
+    /// Folder for sets that are stored on the car [default: synpf/<car> in the user's state folder].
     #[arg(long, value_name = "FOLDER")]
     pub(crate) state: Option<PathBuf>,
     /// Seed of the filter's and the simulator's random numbers.
@@ -129,25 +133,25 @@ pub(crate) struct Run {
     pub(crate) topics: TopicArguments,
 }
 
-/// Over the topics, whatever else a command takes after them.
+/// Heading of the topics in --help.
 const TOPICS: &str = "Topics";
 
-/// Which topics of a bag, or of a live car, to take, and what they do not say.
+/// Which topics of a bag or of a live car to take, and the laser's pose if they lack it.
 #[derive(Debug, Args)]
 pub(crate) struct TopicArguments {
-    /// Laser scans (sensor_msgs/LaserScan) [default: what is there].
+    /// Laser scans (sensor_msgs/LaserScan) [default: /scan, else the first].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) scan_topic: Option<String>,
-    /// Wheel odometry (nav_msgs/Odometry) [default: what is there, fused odometry first].
+    /// Wheel odometry (nav_msgs/Odometry) [default: by the usual names, fused odometry first, else the first].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) odom_topic: Option<String>,
-    /// True poses (nav_msgs/Odometry or geometry_msgs/PoseStamped) [default: /ground_truth/odom, if there].
+    /// True poses (nav_msgs/Odometry or geometry_msgs/PoseStamped) [default: /ground_truth/odom, if it exists].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) truth_topic: Option<String>,
-    /// Gyroscope (sensor_msgs/Imu) [default: what is there, if any].
+    /// Gyroscope (sensor_msgs/Imu) [default: by the usual names, else the first, if any].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
-    /// Pose of the laser on base_link [m, m, rad] [default: by /tf_static; 0.27 m ahead without it].
+    /// Pose of the laser on base_link [m, m, rad] [default: from /tf_static; 0.27 m ahead without it].
     #[arg(long, help_heading = TOPICS, value_name = "X,Y,HEADING", value_parser = laser, allow_hyphen_values = true)]
     pub(crate) laser: Option<Pose>,
 }
@@ -165,10 +169,10 @@ pub(crate) struct Bags {
     /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad.
     #[arg(long, value_name = "FILE.csv", conflicts_with = "truth_topic")]
     pub(crate) truth: Option<PathBuf>,
-    /// Begin so long after the first scan [s].
+    /// Start this long after the first scan [s].
     #[arg(long, value_name = "S", default_value = "0", allow_negative_numbers = true, value_parser = log_seconds)]
     pub(crate) from: f64,
-    /// Take so much of the bag [s] [default: all that follows].
+    /// Length of the part to take [s] [default: to the end].
     #[arg(long = "for", value_name = "S", allow_negative_numbers = true, value_parser = log_seconds)]
     pub(crate) lasting: Option<f64>,
     /// Which topics of the bags to take.
@@ -185,20 +189,19 @@ pub(crate) struct Evaluate {
     /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     pub(crate) params: String,
-    /// Pose of base_link in the map at the first scan [m, m, rad], or `truth`; without it the map is searched.
+    /// Pose of base_link in the map at the first scan [m, m, rad], or `truth`; without it the localizer searches the map.
     #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true)]
     pub(crate) initial_pose: Option<Start>,
     /// Seed of the filter's random numbers; may be repeated, or a list: 0,1,2.
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: Vec<u64>,
-    /// Do something to the log first, and tell what the health state said to it: kidnap@20+4 carries the car on by
-    /// 4 s of driving, 20 s after the first scan, and hides it from odometry; splice@20+4 cuts the same piece out and leaves
-    /// odometry as it was logged, as in a bag that was edited; so do no-scans, no-odometry, blocked (an opponent ahead) and
-    /// black-tubes; may be repeated.
+    /// Add a fault to the log, and report how the health state reacts. kidnap@20+4 moves the car by 4 s of driving, 20 s after
+    /// the first scan, and hides it from odometry. splice@20+4 cuts the same piece out and leaves odometry as it was logged, as
+    /// in an edited bag. The others are no-scans, no-odometry, blocked (an opponent ahead) and black-tubes. May be repeated.
     #[arg(long, value_name = "KIND@S+S", allow_hyphen_values = true)]
     pub(crate) fault: Vec<Fault>,
     /// Write every update to this CSV file (one bag, one seed): stamp_s,x_m,y_m,heading_rad of base_link, the covariance
-    /// xx,xy,yy,xh,yh,hh, the state and the mode, and the scan's fit align,short,long.
+    /// xx,xy,yy,xh,yh,hh, the state and the mode, and the fit of the scan align,short,long.
     #[arg(long, value_name = "OUT.csv")]
     pub(crate) poses: Option<PathBuf>,
     /// One JSON object on stdout; an array of them for several bags or seeds.
@@ -212,14 +215,14 @@ pub(crate) struct Ablate {
     /// What to run over.
     #[command(flatten)]
     pub(crate) bags: Bags,
-    /// The set to arrive at: hq, lq, adaptive, or a YAML file.
+    /// The set to end with: hq, lq, adaptive, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     pub(crate) params: String,
     /// Pose of base_link in the map at the first scan [m, m, rad], or `truth`. The reference cannot search a map, so
-    /// there must be one.
+    /// a pose is needed.
     #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true, default_value = "truth")]
     pub(crate) initial_pose: Start,
-    /// Seeds to take the mean over, as a list: 0,1,2.
+    /// Seeds, as a list; results are means over them.
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0,1,2", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: Vec<u64>,
     /// A JSON array of rows on stdout.
@@ -246,7 +249,7 @@ pub(crate) struct Race {
     /// Parameter set of the filter: hq, lq, adaptive, synpf-baseline, or a YAML file.
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     pub(crate) params: String,
-    /// What tells the driver where the car is.
+    /// Where the driver gets the car's pose from.
     #[arg(long, value_enum, default_value = "synpf")]
     pub(crate) localizer: PoseSource,
     /// Cars on the track, each with a localizer of its own, 1 to 20.
@@ -269,12 +272,12 @@ pub(crate) struct Race {
     pub(crate) json: bool,
 }
 
-/// What the driver goes by, as an argument.
+/// Where the driver gets the pose from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum PoseSource {
-    /// The filter, with the set that --params names.
+    /// SynPF with the set that --params names.
     Synpf,
-    /// The filter with the reference's behaviour, whatever --params says.
+    /// The reference emulation; --params does not matter.
     SynpfBaseline,
     /// Wheel odometry alone.
     Odometry,
@@ -310,14 +313,14 @@ pub(crate) enum TrackCommand {
         /// Seed of a random track.
         #[arg(long, value_name = "N", default_value = "0", allow_negative_numbers = true, value_parser = seed)]
         seed: u64,
-        /// Overwrite what is there.
+        /// Overwrite an existing track.
         #[arg(long)]
         force: bool,
         /// One JSON object on stdout.
         #[arg(long)]
         json: bool,
     },
-    /// Check that a track can be raced on: exit code 1 and every fault if not.
+    /// Check that a track can be raced on. If not, print every fault, with exit code 1.
     Check {
         /// Which track.
         #[command(flatten)]
@@ -340,7 +343,7 @@ pub(crate) enum TrackCommand {
     },
 }
 
-/// A track that is there.
+/// An existing track.
 #[derive(Debug, Args)]
 pub(crate) struct TrackArguments {
     /// Track: club, hall, park, mirror, a folder, or a map.yaml of your own.
@@ -351,20 +354,20 @@ pub(crate) struct TrackArguments {
     pub(crate) raceline: Option<PathBuf>,
 }
 
-/// A number within a range, or what the range is.
+/// Parses a number within a range. The error names the range.
 fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if (least..=most).contains(&value) => Ok(value),
-        _ => Err(format!("wanted is a number from {least} to {most}")),
+        _ => Err(format!("expected a number from {least} to {most}")),
     }
 }
 
-/// A whole number within a range, or what the range is.
+/// Parses a whole number within a range. The error names the range.
 fn whole<T: TryFrom<u64>>(text: &str, least: u64, most: u64) -> Result<T, String> {
     let value = text.parse().ok().filter(|value| (least..=most).contains(value));
     value
         .and_then(|value| value.try_into().ok())
-        .ok_or_else(|| format!("wanted is a whole number from {least} to {most}"))
+        .ok_or_else(|| format!("expected a whole number from {least} to {most}"))
 }
 
 fn seed(text: &str) -> Result<u64, String> {
@@ -397,9 +400,9 @@ fn pose(text: &str) -> Result<Pose, String> {
         .split(',')
         .map(|part| part.trim().parse::<f64>())
         .collect::<Result<Vec<_>, _>>()
-        .map_err(|error| format!("{error}; wanted x,y,heading in m, m, rad"))?;
+        .map_err(|error| format!("{error}; expected x,y,heading in m, m, rad"))?;
     let [x, y, heading] = numbers[..] else {
-        return Err(format!("{} numbers where x,y,heading are three", numbers.len()));
+        return Err(format!("{} numbers; expected three: x,y,heading", numbers.len()));
     };
     let pose = Pose::new(x, y, heading);
     if pose.is_finite() {
@@ -415,7 +418,7 @@ fn laser(text: &str) -> Result<Pose, String> {
     if mount.x.hypot(mount.y) < 10.0 {
         Ok(mount)
     } else {
-        Err("a laser is within 10 m of base_link".into())
+        Err("the laser must be within 10 m of base_link".into())
     }
 }
 
@@ -429,11 +432,11 @@ fn start(text: &str) -> Result<Start, String> {
 }
 
 /// `truth`, `global` or `x,y,heading`.
-fn begin(text: &str) -> Result<Begin, String> {
+fn start_or_global(text: &str) -> Result<Start, String> {
     match text {
-        "truth" => Ok(Begin::Source),
-        "global" => Ok(Begin::Global),
-        _ => pose(text).map(Begin::Pose),
+        "truth" => Ok(Start::Truth),
+        "global" => Ok(Start::Global),
+        _ => pose(text).map(Start::Pose),
     }
 }
 
@@ -443,12 +446,12 @@ mod tests {
     use clap::CommandFactory;
 
     #[test]
-    fn the_definition_is_sound() {
+    fn the_command_line_is_well_defined() {
         Cli::command().debug_assert();
     }
 
     #[test]
-    fn poses_parse_or_say_what_is_wrong() {
+    fn poses_parse_or_name_the_fault() {
         assert_eq!(pose("1, -2,0.5"), Ok(Pose::new(1.0, -2.0, 0.5)));
         assert!(pose("1,2").expect_err("two").contains("2 numbers"));
         assert!(pose("1,2,north").is_err());
@@ -485,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn endpoints_are_refused_before_anything_is_dialled() {
+    fn faulty_endpoints_are_refused() {
         for good in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tls/pit.local:7447"] {
             assert_eq!(endpoint(good), Ok(good.into()));
         }

@@ -5,9 +5,10 @@ use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
-use car_node::evaluate::{self, Fault, FaultReport, Outcome, Start, Truth};
+use car_node::evaluate::{self, Fault, FaultReport, Outcome, Truth};
 use car_node::health::State;
 use car_node::localization::LocalizerParameters;
+use car_node::localization::Start;
 use car_node::sensors::bag::{Arrival, SensorEvent, SensorLog, Topics};
 use car_node::sensors::frames::Mount;
 use car_node::sensors::{Feed, Next, PoseEstimate, Race, Source};
@@ -65,7 +66,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
             }
             Feed::Truth(truth) => log.truth.push((truth.stamp, truth.pose)),
             Feed::Log(word) => panic!("{word}"),
-            Feed::InitialPose(_) => panic!("the recovery crew had to come"),
+            Feed::InitialPose { .. } | Feed::GlobalSearch { .. } => panic!("the recovery crew had to come"),
         }
     }
     log

@@ -2,12 +2,15 @@
 
 mod common;
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use car_node::node::{Node, NodeConfig, RaceMap};
-use car_node::sensors::Race;
+use car_node::sensors::clock::SensorClock;
+use car_node::sensors::frames::Mount;
+use car_node::sensors::{Feed, Next, PoseEstimate, Race, SimulatedCar, Source};
 use common::router;
 use protocol::{
     Action, Answer, CarName, Command, CommandId, Event, EventKind, Health, Key, LinkReport, Message,
@@ -146,6 +149,97 @@ fn select(name: &str, revert_after_ms: Option<u32>) -> Action {
 
 fn revision(answer: &Answer) -> u64 {
     answer.set.revision
+}
+
+/// A simulated car to which others send initial poses and requests.
+struct WithRequests {
+    car: SimulatedCar,
+    /// One of them comes with every hundredth message.
+    requests: VecDeque<Feed>,
+    messages: usize,
+}
+
+impl Source for WithRequests {
+    fn description(&self) -> String {
+        self.car.description()
+    }
+
+    fn mount(&self) -> Mount {
+        self.car.mount()
+    }
+
+    fn clock(&mut self, rate: f64) -> SensorClock {
+        self.car.clock(rate)
+    }
+
+    fn start(&self) -> Option<maps::Pose> {
+        self.car.start()
+    }
+
+    fn next(&mut self, estimate: Option<PoseEstimate>) -> Next {
+        self.messages += 1;
+        let next = self.car.next(estimate);
+        match next {
+            Next::Due(due, _) if self.messages.is_multiple_of(100) => match self.requests.pop_front() {
+                Some(request) => Next::Due(due, request),
+                None => next,
+            },
+            _ => next,
+        }
+    }
+}
+
+#[test]
+fn requests_from_the_car_s_own_network_are_events_at_the_pit_wall() {
+    let wall = Wall::open();
+    let name = CarName::new("oscar").expect("a name");
+    let events = wall.subscribe(&name, Topic::Event);
+    let (node, _) = start("oscar", &wall, |config| {
+        let track = Track::load(tracks().join("club"), None).expect("bundled");
+        let race = Race::new(track, vec![CarSetup::default()], 1, Vec::new());
+        let car = race.car(0);
+        let on_the_map = car.start().expect("known");
+        config.source = Box::new(WithRequests {
+            car,
+            requests: VecDeque::from([
+                Feed::InitialPose {
+                    pose: maps::Pose::new(1e4, 0.0, 0.0),
+                    by: "/initialpose".into(),
+                },
+                Feed::InitialPose {
+                    pose: on_the_map,
+                    by: "/initialpose".into(),
+                },
+                Feed::GlobalSearch {
+                    by: "/clicked_point".into(),
+                },
+            ]),
+            messages: 0,
+        });
+    });
+    // The pose off the map used to be dropped without a word.
+    let relevant = |event: &Event| {
+        matches!(
+            event.kind,
+            EventKind::Warning { .. } | EventKind::PoseInitialized { .. } | EventKind::SearchStarted
+        )
+    };
+    let (_, refused) = next::<Event>(&events, relevant);
+    assert!(
+        matches!(&refused.kind, EventKind::Warning { text } if text.contains("initial pose refused")),
+        "{refused:?}"
+    );
+    assert_eq!(refused.who.as_deref(), Some("/initialpose"));
+    let (_, taken) = next::<Event>(&events, relevant);
+    assert!(
+        matches!(taken.kind, EventKind::PoseInitialized { .. }),
+        "{taken:?}"
+    );
+    assert_eq!(taken.who.as_deref(), Some("/initialpose"));
+    let (_, search) = next::<Event>(&events, relevant);
+    assert!(matches!(search.kind, EventKind::SearchStarted), "{search:?}");
+    assert_eq!(search.who.as_deref(), Some("/clicked_point"));
+    node.shutdown("test over");
 }
 
 #[test]

@@ -1,5 +1,5 @@
-//! A car whose sensors come off ROS 2: a simulated car that publishes as `rmw_zenoh` or a bridge does, and a node that
-//! finds its topics, localizes on them, and survives what is broken.
+//! A car with live ROS 2 sensors: a simulated car publishes as `rmw_zenoh` or a bridge does, and a node finds its topics,
+//! localizes on them, and survives faulty messages.
 
 mod common;
 
@@ -8,9 +8,11 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::localization::Start;
+use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::ros2::messages::{
-    self, Header, LaserScan, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
+    self, Header, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, RosPose, TfMessage,
+    TransformStamped, Vector3,
 };
 use car_node::ros2::pose_publisher;
 use car_node::sensors::bag::{SensorEvent, Topics};
@@ -81,7 +83,7 @@ impl RosCar {
         self.router.put(key, payload).wait().expect("published");
     }
 
-    fn tell(&self, event: &SensorEvent) {
+    fn send(&self, event: &SensorEvent) {
         match event {
             SensorEvent::Scan(scan) => self.publish(
                 "scan",
@@ -131,7 +133,7 @@ fn bytes<T: Serialize>(message: &T) -> Vec<u8> {
     messages::encode(message).expect("encodes")
 }
 
-/// A drive in real time, published until it is told to stop; the driver steers by what the node believes.
+/// A drive in real time, published until `stop` is set. The driver steers by the node's estimate.
 struct Drive {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -158,7 +160,7 @@ fn drive(router: &Session, naming: Naming, track: &Track) -> (Drive, Pose) {
                 };
                 thread::sleep(clock.until(due));
                 match feed {
-                    Feed::Sensor(event) => ros.tell(&event),
+                    Feed::Sensor(event) => ros.send(&event),
                     Feed::Truth(motion) => truth.lock().expect("sound").push((motion.stamp, motion.pose)),
                     _ => {}
                 }
@@ -179,11 +181,13 @@ fn options(endpoint: &str) -> Ros2Options {
         endpoint: endpoint.into(),
         domain: 0,
         topics: Topics::default(),
+        initial_pose_topic: None,
+        outputs: vec![pose_publisher::TOPIC.into()],
         mount: None,
     }
 }
 
-/// Localizes on a car's topics, breaks some messages on the way, and compares with the truth.
+/// Localizes on a car's topics, with some faulty messages, and compares with the truth.
 fn localizes(naming: Naming) {
     let (ros_router, ros_endpoint) = router();
     let (_wall, wall_endpoint) = router();
@@ -194,7 +198,7 @@ fn localizes(naming: Naming) {
     let source = Ros2::find(&options(&ros_endpoint), |_| Instant::now() < until).expect("finds the sensors");
     assert!(
         !source.mount_is_a_guess(),
-        "the car told it before anybody listened"
+        "/tf_static was sent before the node subscribed"
     );
     assert!(
         source.description().contains("/scan, /vesc/odom"),
@@ -231,14 +235,14 @@ fn localizes(naming: Naming) {
     };
     assert_eq!(pose_sink.is_some(), naming == Naming::RmwZenoh);
     let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
-    config.begin = Begin::Pose(start);
+    config.start = Start::Pose(start);
     config.pose_sink = pose_sink;
     config.connect = vec![wall_endpoint];
     let node = Node::start(config).expect("starts");
     let mut compared = 0;
     let mut moved: f64 = 0.0;
     while compared < 200 {
-        assert!(Instant::now() < until, "{compared} beliefs compared");
+        assert!(Instant::now() < until, "{compared} estimates compared");
         thread::sleep(Duration::from_millis(5));
         let Some(estimate) = node.shared().latest_pose() else {
             continue;
@@ -260,7 +264,7 @@ fn localizes(naming: Naming) {
         compared += 1;
         drop(truth);
         if compared == 50 {
-            // Neither of these is a scan.
+            // Neither of these decodes as a scan.
             let key = naming.key("scan", "sensor_msgs::msg::dds_::LaserScan_");
             ros_router
                 .put(&key, vec![0, 1, 0, 0, 9])
@@ -271,7 +275,7 @@ fn localizes(naming: Naming) {
     }
     assert!(moved > 0.5, "the car has driven {moved} m");
     if let Some(poses) = poses {
-        // The controller gets what the filter believes, at odometry rate and with the stamps of the sensors.
+        // The controller gets the estimates at odometry rate, with the stamps of the sensors.
         let poses: Vec<RosOdometry> = poses
             .drain()
             .map(|sample| messages::decode(&sample.payload().to_bytes()).expect("a pose"))
@@ -287,14 +291,14 @@ fn localizes(naming: Naming) {
     }
     drive.stop.store(true, Ordering::Relaxed);
     drive.thread.join().expect("drives");
-    // A silent car ends as quickly as any other.
+    // A car without sensor data ends as quickly as any other.
     let begun = Instant::now();
     node.shutdown("test over");
     assert!(begun.elapsed() < Duration::from_secs(20));
 }
 
 #[test]
-fn a_node_localizes_on_a_car_that_speaks_rmw_zenoh() {
+fn a_node_localizes_on_a_car_with_rmw_zenoh() {
     localizes(Naming::RmwZenoh);
 }
 
@@ -306,24 +310,24 @@ fn a_node_localizes_on_a_car_behind_a_bridge() {
 #[test]
 fn what_is_missing_is_named_while_waiting() {
     let (ros_router, endpoint) = router();
-    let mut said = Vec::new();
+    let mut missing_topics = Vec::new();
     let nobody = options("tcp/127.0.0.1:1");
     let error = Ros2::find(&nobody, |missing| {
-        said.push(missing.to_owned());
+        missing_topics.push(missing.to_owned());
         false
     })
     .err();
     assert!(matches!(error, Some(Ros2Error::Stopped { .. })), "{error:?}");
     assert!(
-        said[0].contains("no zenoh router or bridge answers at tcp/127.0.0.1:1"),
-        "{said:?}"
+        missing_topics[0].contains("no zenoh router or bridge answers at tcp/127.0.0.1:1"),
+        "{missing_topics:?}"
     );
 
-    said.clear();
+    missing_topics.clear();
     let ros = RosCar::new(&ros_router, Naming::RmwZenoh, Pose::new(0.27, 0.0, 0.0));
     let error = Ros2::find(&options(&endpoint), |missing| {
-        said.push(missing.to_owned());
-        // From now on there are scans, on a topic of another name, and still no odometry.
+        missing_topics.push(missing.to_owned());
+        // From now on there are scans, on another topic, and still no odometry.
         ros.publish(
             "front/scan",
             "sensor_msgs::msg::dds_::LaserScan_",
@@ -333,17 +337,202 @@ fn what_is_missing_is_named_while_waiting() {
                 ..LaserScan::default()
             }),
         );
-        said.len() < 4
+        missing_topics.len() < 4
     })
     .err();
     assert!(matches!(error, Some(Ros2Error::Stopped { .. })), "{error:?}");
     assert!(
-        said[0].contains("/scan (sensor_msgs/msg/LaserScan) and"),
-        "{said:?}"
+        missing_topics[0].contains("/scan (sensor_msgs/msg/LaserScan) and"),
+        "{missing_topics:?}"
     );
-    let last = said.last().expect("several");
+    let last = missing_topics.last().expect("several");
     assert!(
         !last.contains("LaserScan") && last.contains("/odom (nav_msgs/msg/Odometry)"),
-        "{said:?}"
+        "{missing_topics:?}"
     );
+}
+
+/// Publishes one scan and one odometry message, as a car in this namespace does.
+fn send_sensors(router: &Session, namespace: &str, odometry: &str) {
+    let now = wall_now();
+    let scan = LaserScan {
+        header: header("laser", now),
+        ranges: vec![1.0; 10],
+        ..LaserScan::default()
+    };
+    let pose = RosOdometry {
+        header: header("odom", now),
+        child_frame_id: "base_link".into(),
+        ..RosOdometry::default()
+    };
+    let messages = [
+        (
+            format!("{namespace}scan"),
+            "sensor_msgs::msg::dds_::LaserScan_",
+            bytes(&scan),
+        ),
+        (
+            format!("{namespace}{odometry}"),
+            "nav_msgs::msg::dds_::Odometry_",
+            bytes(&pose),
+        ),
+    ];
+    for (topic, dds_type, payload) in messages {
+        let key = Naming::RmwZenoh.key(&topic, dds_type);
+        router.put(key, payload).wait().expect("published");
+    }
+}
+
+/// Finds the sensors of a car in this namespace, which sends until they are found.
+fn find_in(router: &Session, namespace: &str, options: &Ros2Options) -> Ros2 {
+    let found = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            while !found.load(Ordering::Relaxed) {
+                send_sensors(router, namespace, "odom");
+                thread::sleep(Duration::from_millis(20));
+            }
+        });
+        let until = Instant::now() + DEADLINE;
+        let source = Ros2::find(options, |_| Instant::now() < until);
+        found.store(true, Ordering::Relaxed);
+        source.expect("finds the sensors")
+    })
+}
+
+/// Publishes a pose at this x on a topic, with `rmw_zenoh` and behind a bridge.
+fn send_pose(router: &Session, topic: &str, frame: &str, x: f64) {
+    let message = PoseWithCovarianceStamped {
+        header: header(frame, wall_now()),
+        pose: RosPose::from(Pose::new(x, 0.0, 0.0)),
+        ..PoseWithCovarianceStamped::default()
+    };
+    for naming in [Naming::RmwZenoh, Naming::Bridge] {
+        let key = naming.key(topic, "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_");
+        router.put(key, bytes(&message)).wait().expect("published");
+    }
+}
+
+/// What the source delivers besides sensor data, while `send` is called again and again.
+fn next_request(source: &mut Ros2, mut send: impl FnMut()) -> Feed {
+    let until = Instant::now() + DEADLINE;
+    while Instant::now() < until {
+        send();
+        while let Next::Due(_, feed) = source.next(None) {
+            if !matches!(feed, Feed::Sensor(_)) {
+                return feed;
+            }
+        }
+    }
+    panic!("nothing within {DEADLINE:?}");
+}
+
+/// AMCL publishes its estimate on `/amcl_pose`, `slam_toolbox` on `/pose`. Such a message used to move the car there.
+#[test]
+fn an_initial_pose_is_taken_from_its_own_topic_only() {
+    let other_topics = [
+        "amcl_pose",
+        "pose",
+        "tracked_pose/with_covariance",
+        "car2/initialpose",
+    ];
+    let cases = [
+        ("", None, "/initialpose"),
+        ("car1/", None, "/car1/initialpose"),
+        ("car1/", Some("/start"), "/start"),
+    ];
+    for (namespace, asked, expected) in cases {
+        let (router, endpoint) = router();
+        let options = Ros2Options {
+            initial_pose_topic: asked.map(str::to_owned),
+            ..options(&endpoint)
+        };
+        let mut source = find_in(&router, namespace, &options);
+        assert!(
+            source
+                .description()
+                .ends_with(&format!("initial poses from {expected}")),
+            "{}",
+            source.description()
+        );
+        let others = ["initialpose", "car1/initialpose"]
+            .into_iter()
+            .chain(other_topics)
+            .filter(|topic| format!("/{topic}") != expected);
+        // Every round sends all of them, so that the one that is taken cannot come before the others were seen.
+        for _ in 0..2 {
+            let feed = next_request(&mut source, || {
+                for topic in others.clone() {
+                    send_pose(&router, topic, "map", 50.0);
+                }
+                send_pose(&router, expected.trim_start_matches('/'), "map", 3.0);
+            });
+            let Feed::InitialPose { pose, by } = feed else {
+                panic!("{feed:?}")
+            };
+            assert_eq!(by, expected);
+            assert!((pose.x - 3.0).abs() < 1e-9, "{pose:?} of {by}");
+        }
+    }
+}
+
+#[test]
+fn an_initial_pose_in_another_frame_is_refused_with_the_frame_named() {
+    let (router, endpoint) = router();
+    let mut source = find_in(&router, "", &options(&endpoint));
+    let feed = next_request(&mut source, || send_pose(&router, "initialpose", "odom", 3.0));
+    assert!(
+        matches!(&feed, Feed::Log(text) if text.contains("/initialpose") && text.contains("\"odom\"")),
+        "{feed:?}"
+    );
+}
+
+#[test]
+fn a_clicked_point_asks_for_a_global_search() {
+    let (router, endpoint) = router();
+    let mut source = find_in(&router, "car1/", &options(&endpoint));
+    let send = |topic: &str| {
+        let key = Naming::RmwZenoh.key(topic, "geometry_msgs::msg::dds_::PointStamped_");
+        let message = PointStamped {
+            header: header("map", wall_now()),
+            point: Vector3::default(),
+        };
+        router.put(key, bytes(&message)).wait().expect("published");
+    };
+    let feed = next_request(&mut source, || {
+        send("car2/clicked_point");
+        send("car1/clicked_point");
+    });
+    let expected = Feed::GlobalSearch {
+        by: "/car1/clicked_point".into(),
+    };
+    assert_eq!(feed, expected);
+}
+
+#[test]
+fn what_the_node_publishes_is_no_input() {
+    let (router, endpoint) = router();
+    // The only odometry is the output of a localizer.
+    let mut rounds = 0;
+    let error = Ros2::find(&options(&endpoint), |_| {
+        send_sensors(&router, "", "pf/pose/odom");
+        rounds += 1;
+        rounds < 4
+    })
+    .err();
+    let Some(Ros2Error::Stopped { missing }) = error else {
+        panic!("{error:?}")
+    };
+    assert!(missing.contains("/odom (nav_msgs/msg/Odometry)"), "{missing}");
+
+    let topics = Topics {
+        odometry: Some("pf/pose/odom".into()),
+        ..Topics::default()
+    };
+    let asked = Ros2Options {
+        topics,
+        ..options(&endpoint)
+    };
+    let error = Ros2::find(&asked, |_| false).err();
+    assert!(matches!(error, Some(Ros2Error::OwnOutput(_))), "{error:?}");
 }

@@ -202,7 +202,9 @@ fn a_pose_goes_on_through_every_switch_of_set_on_slipping_tyres() {
                 }
             }
             Feed::Log(_) => {}
-            Feed::InitialPose(_) => panic!("the recovery crew had to come under {}", CIRCUIT[under]),
+            Feed::InitialPose { .. } | Feed::GlobalSearch { .. } => {
+                panic!("the recovery crew had to come under {}", CIRCUIT[under])
+            }
         }
     }
     car.stop();

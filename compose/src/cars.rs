@@ -5,7 +5,8 @@ use std::thread;
 use std::time::Duration;
 
 use car_node::control::parameter_sets;
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::localization::Start;
+use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::sensors::{Incident, Race, ScriptedIncident};
 use protocol::CarName;
 use simulator::{CarSetup, DriverParams, Grip, Guidance, OdometryParams, Track, YawSource};
@@ -51,7 +52,7 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
             let car = CarName::new(format!("car-{}", index + 1))?;
             let mut config = NodeConfig::new(car, map.clone(), Box::new(race.car(index)));
             config.set = Some(parameter_sets::load(&options.params)?);
-            config.begin = Begin::Source;
+            config.start = Start::Truth;
             config.seed = options.seed.wrapping_add(index as u64);
             let last = index + 1 == count;
             config.connect = vec![if last { radio } else { &options.listen }.to_owned()];

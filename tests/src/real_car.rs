@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::localization::Start;
+use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::sensors::Race;
 use protocol::CarName;
 use simulator::{CarSetup, Track};
@@ -24,7 +25,7 @@ pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Pat
     };
     let race = Race::new(track, vec![setup], 1, Vec::new());
     let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
-    config.begin = Begin::Source;
+    config.start = Start::Truth;
     config.connect = vec![endpoint.to_owned()];
     config.state = state.map(Path::to_owned);
     Node::start(config).expect("a car")

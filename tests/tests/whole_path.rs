@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::localization::Start;
+use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::sensors::BagPlayer;
 use car_node::sensors::bag::{Bag, Topics};
 use pitwall::{EventPayload, Verdict, read_events};
@@ -29,7 +30,7 @@ fn start(name: &str, folder: &Path, endpoint: &str) -> Node {
     };
     let car = CarName::new(name).expect("a good name");
     let mut config = NodeConfig::new(car, map, Box::new(BagPlayer::new(bag, log)));
-    config.begin = Begin::Pose(true_pose(0.0));
+    config.start = Start::Pose(true_pose(0.0));
     config.connect = vec![endpoint.to_owned()];
     Node::start(config).expect("a car")
 }

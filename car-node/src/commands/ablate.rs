@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use car_node::evaluate::ablation::{Change, Step, steps};
-use car_node::evaluate::{Outcome, Start, Summaries, Truth, run as run_over};
+use car_node::evaluate::{Outcome, Summaries, Truth, run as run_over};
+use car_node::localization::Start;
 use car_node::sensors::bag::SensorLog;
 use car_node::sensors::frames::Mount;
 use car_node::statistics::mean;
@@ -28,7 +29,7 @@ struct Row {
     lateral_rmse_m: Option<f64>,
     longitudinal_rmse_m: Option<f64>,
     heading_rmse_rad: Option<f64>,
-    /// The farthest off in any seed [m].
+    /// Largest error of all seeds [m].
     position_max_m: Option<f64>,
     excursions: Option<f64>,
     alignment: Option<f64>,
@@ -70,7 +71,7 @@ pub(crate) fn run(arguments: &Ablate) -> anyhow::Result<()> {
     let set = super::load_set(&arguments.params)?;
     let steps = steps(&set.parameters)
         .map_err(SetUpError::Parameters)
-        .with_context(|| format!("{}: no way there from synpf-baseline", set.name))?;
+        .with_context(|| format!("{}: no steps lead to it from synpf-baseline", set.name))?;
     let map = super::load_map(&arguments.bags.map)?;
     let logs = super::read_bags(&arguments.bags)?;
 

@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use car_node::evaluate::{Fault, FaultReport, Nees, Outcome, Start, Truth, run as run_over};
+use car_node::evaluate::{Fault, FaultReport, Nees, Outcome, Truth, run as run_over};
 use car_node::health::State;
+use car_node::localization::Start;
 use car_node::sensors::bag::SensorLog;
 use car_node::statistics::ErrorSummary;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -22,7 +23,7 @@ use crate::cli::Evaluate;
 struct RangeTable {
     /// Time to build it [ms].
     build_ms: f64,
-    /// PersistedState that it takes.
+    /// Memory that it takes.
     bytes: usize,
 }
 
@@ -34,7 +35,7 @@ struct Report {
     seed: u64,
     #[serde(flatten)]
     outcome: Outcome,
-    /// What the health state said to each `--fault`.
+    /// How the health state reacted to each `--fault`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     faults: Vec<FaultReport>,
     range_table: RangeTable,
@@ -42,7 +43,7 @@ struct Report {
 
 pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     if arguments.poses.is_some() && arguments.bags.files.len() * arguments.seed.len() > 1 {
-        let text = "--poses takes the poses of one run: give one --bag and one --seed";
+        let text = "--poses writes the poses of one run: give one --bag and one --seed";
         bail!(BadUsage(text.into()));
     }
     let mut faults = arguments.fault.clone();
@@ -59,13 +60,13 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
             );
             bail!(BadUsage(text));
         }
-        // The last first: cutting a piece out moves all that comes after it.
+        // The last fault first: cutting a piece out moves everything after it.
         for fault in faults.iter().rev() {
             fault.apply(log);
         }
     }
-    // Only the part of the map that the car can get to from its start, where that is known: a whole building takes
-    // a minute and a gigabyte.
+    // The table covers only what the car can reach from its start, if that is known: a whole building takes a minute and a
+    // gigabyte.
     let start = arguments.initial_pose.unwrap_or(Start::Global);
     let place = match start {
         Start::Pose(pose) => Some(pose),
@@ -112,7 +113,8 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the state said to each fault. A kidnapping or a splice cuts its time out of the log: all that follows is that much earlier.
+/// How the state reacted to each fault. A kidnapping or a splice cuts its time out of the log: everything after it moves by
+/// that time.
 fn fault_reports(faults: &[Fault], outcome: &Outcome) -> Vec<FaultReport> {
     let mut cut = 0.0;
     let moved: Vec<Fault> = faults
@@ -220,7 +222,7 @@ impl PoseFile {
     }
 }
 
-/// One run, line by line.
+/// Prints one run in full.
 fn print_one(report: &Report) {
     let Report {
         outcome, range_table, ..
@@ -256,7 +258,7 @@ fn print_one(report: &Report) {
             if let Some(nees) = &outcome.nees {
                 let line = |name: &str, dimension: u32, of: &Nees| {
                     say!(
-                        "  {name:<12} {:>9.2}  NEES, {dimension} if honest; {:.1}% above the 95% bound",
+                        "  {name:<12} {:>9.2}  NEES (consistent: {dimension}); {:.1}% above the 95% bound",
                         of.mean,
                         of.above_95 * 100.0
                     );
@@ -281,7 +283,7 @@ fn print_one(report: &Report) {
         let percent =
             |share: Option<f64>| share.map_or("-".to_owned(), |share| format!("{:.1}%", share * 100.0));
         say!(
-            "  LOCALIZED is right {}, right is LOCALIZED {}; falsely LOST {}, falsely LOCALIZED {}",
+            "  LOCALIZED    precision {}, recall {}; {} updates LOST though right, {} LOCALIZED though wrong",
             percent(truth.precision),
             percent(truth.recall),
             truth.false_lost,
@@ -316,10 +318,10 @@ fn print_one(report: &Report) {
     );
 }
 
-/// Several runs, a row each.
+/// Prints several runs, one row each.
 fn print_table(reports: &[Report]) {
     say!(
-        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
         "bag",
         "seed",
         "updates",
@@ -328,6 +330,8 @@ fn print_table(reports: &[Report]) {
         "lat rmse",
         "lon rmse",
         "hdg rmse",
+        "pos nees",
+        "hdg nees",
         "excurs",
         "align",
         "al p05",
@@ -335,7 +339,7 @@ fn print_table(reports: &[Report]) {
         "us p99"
     );
     say!(
-        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8}",
+        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
         "",
         "",
         "",
@@ -343,7 +347,9 @@ fn print_table(reports: &[Report]) {
         "cm",
         "cm",
         "cm",
-        "deg"
+        "deg",
+        "of 2",
+        "of 1"
     );
     let mut previous = None;
     for report in reports {
@@ -360,7 +366,7 @@ fn print_table(reports: &[Report]) {
         };
         previous = Some(&report.bag);
         say!(
-            "{name:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+            "{name:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
             report.seed,
             outcome.updates,
             outcome.dropped.values().sum::<usize>(),
@@ -368,6 +374,8 @@ fn print_table(reports: &[Report]) {
             rmse(|errors| errors.lateral_error_m, 100.0),
             rmse(|errors| errors.longitudinal_error_m, 100.0),
             rmse(|errors| errors.heading_error_rad, 1_f64.to_degrees()),
+            or_dash(outcome.nees.as_ref().map(|nees| nees.position.mean), 2),
+            or_dash(outcome.nees.as_ref().map(|nees| nees.heading.mean), 2),
             or_dash(outcome.errors.as_ref().map(|errors| errors.excursions as f64), 0),
             or_dash(outcome.alignment.map(|alignment| alignment.mean), 3),
             or_dash(outcome.alignment.map(|alignment| alignment.p05), 3),

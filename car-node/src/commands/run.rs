@@ -6,7 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
-use car_node::node::{Begin, Node, NodeConfig, RaceMap};
+use car_node::localization::Start;
+use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::ros2::pose_publisher;
 use car_node::sensors::frames::Mount;
 use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source};
@@ -17,31 +18,31 @@ use synpf::{TablePolicy, TrackMap};
 
 use crate::cli::{Odometry, Run, SourceKind};
 
-/// After the last message of a bag: time for the pit wall to fetch what it has missed.
+/// Time after the last message of a bag for the pit wall to recover gaps.
 const LINGER: Duration = Duration::from_secs(1);
 
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let signal = signals()?;
     let mut pose_sink = None;
-    let (map, source, begin): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
+    let (map, source, start): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
         (SourceKind::Bag, Some(bag)) => {
             let mut log = super::read_bag(bag, &arguments.topics)?;
             log.mount = Some(super::mount(bag, &log));
             let player = BagPlayer::new(bag.clone(), log);
-            (map_file(arguments)?, Box::new(player), Begin::Global)
+            (map_file(arguments)?, Box::new(player), Start::Global)
         }
         (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
         (SourceKind::Ros2, _) => {
             if arguments.connect.is_empty() {
-                let text = "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: what answers at that \
-                            port on the car is ROS, not a pit wall";
+                let text = "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: the default port on the \
+                            car belongs to ROS, not to a pit wall";
                 bail!(super::BadUsage(text.into()));
             }
-            // The map first: its faults show without ROS.
+            // The map first, so that its faults show without ROS.
             let map = map_file(arguments)?;
             let source = ros2(arguments, &signal)?;
             pose_sink = pose_for_ros(arguments, &source)?;
-            (map, Box::new(source), Begin::Global)
+            (map, Box::new(source), Start::Global)
         }
         (SourceKind::Simulator, _) => {
             let track = super::find_track(&arguments.map.to_string_lossy(), arguments.raceline.as_deref())?;
@@ -49,15 +50,16 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
                 track.name.clone(),
                 track.grid.clone(),
                 Some(track.raceline.clone()),
-            )?;
+            )
+            .with_context(|| arguments.map.display().to_string())?;
             let race = Race::new(track, vec![setup(arguments.odometry)], arguments.seed, Vec::new());
-            (map, Box::new(race.car(0)), Begin::Source)
+            (map, Box::new(race.car(0)), Start::Truth)
         }
     };
     let description = source.description();
     let mut config = NodeConfig::new(arguments.car.clone(), map, source);
     config.set = arguments.params.as_deref().map(super::load_set).transpose()?;
-    config.begin = arguments.initial_pose.unwrap_or(begin);
+    config.start = arguments.initial_pose.unwrap_or(start);
     config.seed = arguments.seed;
     config.rate = arguments.rate;
     config.connect.clone_from(&arguments.connect);
@@ -74,42 +76,47 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     } else {
         arguments.connect.join(", ")
     };
-    eprintln!("{}: {description}; dials {wall}. Ctrl-C ends it.", arguments.car);
+    eprintln!(
+        "{}: {description}; connects to {wall}. Ctrl-C ends it.",
+        arguments.car
+    );
     let reason = wait(&node, &signal, arguments.stay);
     let estimate = node.shared().latest_pose();
     node.shutdown(reason);
     match estimate {
         Some(estimate) => eprintln!(
-            "{}: {reason}; last at {:.2}, {:.2} m, {:.1} deg.",
+            "{}: {reason}; last pose {:.2}, {:.2} m, {:.1} deg.",
             arguments.car,
             estimate.pose.x,
             estimate.pose.y,
             estimate.pose.heading.to_degrees()
         ),
-        None => eprintln!("{}: {reason}; never had a pose.", arguments.car),
+        None => eprintln!("{}: {reason}; there was no pose.", arguments.car),
     }
     Ok(())
 }
 
-/// Finds the live sensors, and says what it waits for.
+/// Finds the live sensors. Prints what is missing while it waits.
 fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2> {
     let domain = match (arguments.ros_domain, env::var("ROS_DOMAIN_ID")) {
         (Some(domain), _) => domain,
         (None, Ok(text)) if !text.is_empty() => text
             .parse()
-            .with_context(|| format!("ROS_DOMAIN_ID={text} is not a domain"))?,
+            .with_context(|| format!("ROS_DOMAIN_ID={text} is no ROS domain"))?,
         _ => 0,
     };
     let options = Ros2Options {
         endpoint: arguments.ros.clone(),
         domain,
         topics: super::topics(&arguments.topics),
+        initial_pose_topic: arguments.initial_pose_topic.clone(),
+        outputs: vec![arguments.pose_topic.clone()],
         mount: arguments.topics.laser.map(Mount::upright),
     };
-    let mut said = String::new();
+    let mut printed = String::new();
     let source = Ros2::find(&options, |missing| {
-        if missing != said {
-            missing.clone_into(&mut said);
+        if missing != printed {
+            missing.clone_into(&mut printed);
             eprintln!(
                 "{}: waiting for ROS 2 (domain {domain}): {missing}",
                 arguments.car
@@ -123,27 +130,27 @@ fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2
     Ok(source)
 }
 
-/// Where the pose goes for the car's own nodes, unless they are behind a bridge.
+/// Publishes the pose to the car's own nodes. None behind a bridge.
 fn pose_for_ros(arguments: &Run, source: &Ros2) -> anyhow::Result<Option<Sender<PoseEstimate>>> {
     let Some(ros) = source.ros_connection() else {
         eprintln!(
-            "car-node: warning: behind a bridge the pose is not published to ROS ({}): it takes rmw_zenoh",
+            "car-node: warning: the pose is not published to ROS on {}: behind a bridge that is not possible yet, rmw_zenoh is needed",
             arguments.pose_topic
         );
         return Ok(None);
     };
     let (pose_sink, _) = pose_publisher::start(ros.clone(), &arguments.pose_topic)
-        .map_err(|error| anyhow!("{}: cannot be published: {error}", arguments.pose_topic))?;
+        .map_err(|error| anyhow!("{}: cannot publish the pose: {error}", arguments.pose_topic))?;
     Ok(Some(pose_sink))
 }
 
-/// Waits for whatever ends the node first, and says what that was.
+/// Waits for the end of the node, and returns the reason.
 fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static str {
     let mut ended = None;
     loop {
         match signal.recv_timeout(Duration::from_millis(50)) {
             Ok(reason) => return reason,
-            Err(RecvTimeoutError::Disconnected) => return "signals are gone",
+            Err(RecvTimeoutError::Disconnected) => return "the signal handler ended",
             Err(RecvTimeoutError::Timeout) => {}
         }
         if !stay && node.source_ended() && ended.get_or_insert_with(Instant::now).elapsed() > LINGER {
@@ -152,12 +159,12 @@ fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static st
     }
 }
 
-/// The name of the signal that ends the node, when it comes.
+/// Receives the name of the signal that ends the node.
 fn signals() -> anyhow::Result<Receiver<&'static str>> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
-    let (tell, told) = bounded(1);
+    let (sender, signal) = bounded(1);
     std::thread::Builder::new()
         .name("signals".into())
         .spawn(move || {
@@ -165,16 +172,16 @@ fn signals() -> anyhow::Result<Receiver<&'static str>> {
                 let Ok(mut terminate) =
                     tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())
                 else {
-                    return "signals are gone";
+                    return "the signal handler ended";
                 };
                 tokio::select! {
                     _ = tokio::signal::ctrl_c() => "interrupted",
                     _ = terminate.recv() => "terminated",
                 }
             });
-            tell.send(reason).ok();
+            sender.send(reason).ok();
         })?;
-    Ok(told)
+    Ok(signal)
 }
 
 fn map_file(arguments: &Run) -> anyhow::Result<RaceMap> {
@@ -185,7 +192,7 @@ fn map_file(arguments: &Run) -> anyhow::Result<RaceMap> {
         None if beside.exists() => Some(Raceline::load(beside)?),
         None => None,
     };
-    // A map is called by its folder when its file is only called map.
+    // A map has the name of its folder when its file is only called map.
     let stem = arguments.map.file_stem().unwrap_or_default().to_string_lossy();
     let folder = arguments.map.parent().and_then(Path::file_name);
     let name = match folder {
@@ -203,7 +210,7 @@ fn race_map(name: String, grid: OccupancyGrid, raceline: Option<Raceline>) -> an
     })
 }
 
-/// The simulated car: on taped tyres its odometry knows its turning from the steering alone.
+/// The simulated car. On taped tyres its odometry derives the yaw rate from the steering alone.
 fn setup(odometry: Odometry) -> CarSetup {
     let mut setup = CarSetup::default();
     if odometry == Odometry::Lq {
@@ -216,7 +223,7 @@ fn setup(odometry: Odometry) -> CarSetup {
     setup
 }
 
-/// `$XDG_STATE_HOME/synpf/<car>`, by default in `~/.local/state`; None for a user without a home.
+/// `$XDG_STATE_HOME/synpf/<car>`, by default in `~/.local/state`; None for a user without a home folder.
 fn default_state_folder(car: &str) -> Option<PathBuf> {
     let base = env::var_os("XDG_STATE_HOME")
         .filter(|folder| !folder.is_empty())

@@ -1,5 +1,5 @@
-//! A filter over a whole log, as fast as it goes, held against the truth. Same inputs, same numbers (but for
-//! the times taken).
+//! Runs a localizer over a whole log as fast as it can, and compares its poses with the truth. The same inputs give the same
+//! numbers, except for the times.
 
 pub mod ablation;
 mod consistency;
@@ -12,7 +12,6 @@ mod truth;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use maps::Pose;
 use serde::Serialize;
 use synpf::{Dropped, Localizer, PoseError, Stamp, Update};
 
@@ -26,37 +25,27 @@ pub use truth::Truth;
 use consistency::ConsistencyCheck;
 
 use crate::health::{Monitor, State, Thresholds};
+use crate::localization::Start;
 use crate::sensors::bag::{Arrival, SensorEvent};
 use crate::statistics::{mean, percentile};
 
-/// Where a run starts from.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Start {
-    /// From this `map_from_base_link`, true when the first scan arrives.
-    Pose(Pose),
-    /// From the true pose when the first scan arrives.
-    Truth,
-    /// From nothing: the localizer searches the map.
-    Global,
-}
-
-/// Mean and low end of a share.
+/// Mean and 5th percentile of the alignment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct AlignmentSummary {
     /// Mean over all updates.
     pub mean: f64,
-    /// The value that 95 % of the updates exceed.
+    /// 95 % of the updates are above this.
     pub p05: f64,
 }
 
-/// Times taken by whole updates [us].
+/// Times of whole updates [us].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct UpdateTimes {
     /// Median.
     pub p50: f64,
-    /// 99 of 100 are faster.
+    /// 99th percentile.
     pub p99: f64,
-    /// The slowest.
+    /// Maximum.
     pub max: f64,
 }
 
@@ -67,14 +56,14 @@ pub struct ParticleSummary {
     pub mean: f64,
 }
 
-/// What one run gave.
+/// The results of one run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Outcome {
     /// Scans in the log.
     pub scans: usize,
     /// Scans that led to a pose.
     pub updates: usize,
-    /// Messages that did not count, by cause.
+    /// Messages that were refused, by cause.
     pub dropped: BTreeMap<Dropped, usize>,
     /// Errors against the truth, where there is any.
     #[serde(flatten)]
@@ -82,11 +71,11 @@ pub struct Outcome {
     /// Consistency of the covariance, where there is truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub nees: Option<Consistency>,
-    /// Share of the updates spent in each health state.
+    /// Share of the updates in each health state.
     pub state_share: BTreeMap<State, f64>,
     /// Every change of the health state.
     pub state_changes: Vec<StateChange>,
-    /// What the states are worth, where there is truth.
+    /// How often the states were right, where there is truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub state_truth: Option<StateTruth>,
     /// Scan alignment; None without an update.
@@ -100,18 +89,19 @@ pub struct Outcome {
     pub particles: Option<ParticleSummary>,
 }
 
-/// Why a run cannot start.
+/// Why a run does not start.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
-    /// There is no truth to start from.
+    /// The run should start at the true pose, which is unknown.
     #[error("the true pose at the first scan is not known; give --initial-pose x,y,heading")]
     NoTruth,
-    /// The pose to start from is refused.
+    /// The initial pose is refused.
     #[error(transparent)]
     Start(#[from] PoseError),
 }
 
-/// Runs `localizer` over `arrivals`. `observe` sees every update, the health state after it, and the share of the log done so far.
+/// Runs `localizer` over `arrivals`. `observe` gets every update, the health state after it, and the share of the log that is
+/// done.
 pub fn run(
     localizer: &mut dyn Localizer,
     arrivals: &[Arrival],
@@ -130,7 +120,7 @@ pub fn run(
     let mut consistency = ConsistencyCheck::default();
 
     for (index, arrival) in arrivals.iter().enumerate() {
-        // A car looks at its clock all the time; a log has one only where something arrives.
+        // A car checks its clock all the time. A log has a time only where a message arrives.
         if scans > 0 && monitor.tick(arrival.log_time).state == State::Stale {
             states.change(arrival.log_time, State::Stale, None);
         }
@@ -194,7 +184,7 @@ pub fn run(
     })
 }
 
-/// Gives the localizer its start; `now` is the latest odometry's stamp.
+/// Gives the localizer its initial pose, or starts the search; `now` is the latest odometry's stamp.
 fn begin(
     localizer: &mut dyn Localizer,
     truth: &Truth,

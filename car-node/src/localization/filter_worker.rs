@@ -144,6 +144,13 @@ impl FilterWorker {
             .event(self.now(), self.update_number(), kind, None, None);
     }
 
+    /// Queues an event that the source of the sensor data caused.
+    fn event_by(&self, kind: EventKind, by: &str) {
+        self.config
+            .shared
+            .event(self.now(), self.update_number(), kind, Some(by), None);
+    }
+
     /// The rates that are wanted, lowered by the throttle.
     fn rates(&self) -> Rates {
         let shared = &self.config.shared;
@@ -155,7 +162,6 @@ impl FilterWorker {
     /// Executes a command. A reply that nobody waits for any more is discarded.
     fn execute(&mut self, command: FilterCommand) {
         let next = self.update_number() + 1;
-        let now = self.now();
         match command {
             FilterCommand::SetParameters { set, change, reply } => {
                 let changed = self.change_localizer(change);
@@ -183,9 +189,7 @@ impl FilterWorker {
                 reply.send(selected).ok();
             }
             FilterCommand::Relocalize { reply } => {
-                self.config.localizer.relocalize();
-                self.config.monitor.on_search(now);
-                self.laps.on_new_pose();
+                self.relocalize();
                 reply.send(next).ok();
             }
         }
@@ -217,6 +221,13 @@ impl FilterWorker {
         Ok(())
     }
 
+    fn relocalize(&mut self) {
+        self.config.localizer.relocalize();
+        let now = self.now();
+        self.config.monitor.on_search(now);
+        self.laps.on_new_pose();
+    }
+
     /// The pose now of a candidate: as it was listed, moved by the odometry since.
     fn listed_candidate(&self, number: usize) -> Result<Pose, String> {
         let Listed { candidates, odometry } = &self.listed;
@@ -243,7 +254,11 @@ impl FilterWorker {
                 return;
             }
             Feed::Log(text) => return self.event(EventKind::Warning { text }),
-            Feed::InitialPose(pose) => return self.initialize_from_source(pose),
+            Feed::InitialPose { pose, by } => return self.initialize_from_source(pose, &by),
+            Feed::GlobalSearch { by } => {
+                self.relocalize();
+                return self.event_by(EventKind::SearchStarted, &by);
+            }
         };
         let now = self.now();
         let stamp = event.stamp();
@@ -262,14 +277,18 @@ impl FilterWorker {
         }
     }
 
-    fn initialize_from_source(&mut self, pose: Pose) {
+    fn initialize_from_source(&mut self, pose: Pose, by: &str) {
         let before = self.last_update.as_ref().map(|update| wire::pose2(update.pose));
-        if self.initialize(pose).is_ok() {
-            self.event(EventKind::PoseInitialized {
+        let kind = match self.initialize(pose) {
+            Ok(()) => EventKind::PoseInitialized {
                 before,
                 pose: wire::pose2(pose),
-            });
-        }
+            },
+            Err(fault) => EventKind::Warning {
+                text: format!("{by}: initial pose refused: {fault}"),
+            },
+        };
+        self.event_by(kind, by);
     }
 
     fn on_odometry(&mut self, odometry: Odometry, now: Stamp) -> Result<(), Dropped> {

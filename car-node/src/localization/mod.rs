@@ -7,7 +7,9 @@ mod localizer_parameters;
 mod pace;
 pub mod shadow;
 pub mod shadow_channel;
+mod start;
 pub mod table_worker;
 mod views;
 
 pub use localizer_parameters::{KIND_KEY, LocalizerParameters};
+pub use start::Start;

@@ -1,4 +1,4 @@
-//! A car: its threads, how they are wired, and how they end.
+//! A car: its threads, the channels between them, and how they end.
 //!
 //! ```text
 //! source --feed--> filter --telemetry queue--> publisher ==zenoh==> pit wall
@@ -28,6 +28,7 @@ use crate::control::persisted_state::PersistedState;
 use crate::control::query_server::QueryServer;
 use crate::control::{CommandHandlerConfig, SEARCH_PATIENCE, StateFile, StateFileError, command_server};
 use crate::health::{Monitor, Thresholds};
+use crate::localization::Start;
 use crate::localization::filter_worker::{self, FilterConfig};
 use crate::localization::shadow;
 use crate::localization::shadow_channel::shadow_channel;
@@ -40,25 +41,14 @@ use crate::telemetry::replay_buffer::ReplayBuffer;
 use crate::telemetry::shared_state::{DEFAULT_RATES, SharedState};
 use crate::wire;
 
-/// Where a car begins.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Begin {
-    /// Here: `map_from_base_link`.
-    Pose(Pose),
-    /// Where the source says, as a simulator does and a bag with ground truth.
-    Source,
-    /// It searches the map.
-    Global,
-}
-
 /// A map ready to race on.
 #[derive(Debug, Clone)]
 pub struct RaceMap {
-    /// What to call it.
+    /// Its name.
     pub name: String,
     /// The map, shared between the cars of one process.
     pub map: Arc<TrackMap>,
-    /// The line to measure progress along.
+    /// The line along which progress is measured.
     pub raceline: Option<Arc<Raceline>>,
 }
 
@@ -70,31 +60,31 @@ pub struct NodeConfig {
     pub map: RaceMap,
     /// Its sensors.
     pub source: Box<dyn Source>,
-    /// How many times as fast as real time a recording is played.
+    /// Speed at which a recording is played; 1 is real time.
     pub rate: f64,
     /// The set to start with; None for the one that was in force when the car last ran, and `hq` for a new car.
     pub set: Option<NamedSet>,
-    /// Where it begins.
-    pub begin: Begin,
+    /// Where the localizer starts.
+    pub start: Start,
     /// Seed of the filter.
     pub seed: u64,
-    /// Endpoints of pit walls, such as `tcp/192.168.1.10:7447`; empty looks for one on this machine and, by
-    /// multicast, on the local network.
+    /// Endpoints of pit walls, such as `tcp/192.168.1.10:7447`. Without one, the car looks for a pit wall on this machine and,
+    /// by multicast, on the local network.
     pub connect: Vec<String>,
-    /// How often to send what.
+    /// How often each topic is sent.
     pub rates: Rates,
-    /// Send poses at odometry rate, predicted, and not only at scan rate.
+    /// Send predicted poses at odometry rate, and not only poses at scan rate.
     pub predict: bool,
-    /// What counts as good.
+    /// Limits of the health state.
     pub thresholds: Thresholds,
-    /// Folder for what survives a restart; None forgets.
+    /// Folder for what survives a restart; without one, nothing does.
     pub state: Option<PathBuf>,
     /// Receives every pose estimate while the car is localized, such as for the car's controller.
     pub pose_sink: Option<Sender<PoseEstimate>>,
 }
 
 impl NodeConfig {
-    /// A car with everything else as usual.
+    /// A car with the default of everything else.
     pub fn new(car: CarName, map: RaceMap, source: Box<dyn Source>) -> Self {
         Self {
             car,
@@ -102,7 +92,7 @@ impl NodeConfig {
             source,
             rate: 1.0,
             set: None,
-            begin: Begin::Source,
+            start: Start::Truth,
             seed: 0,
             connect: Vec::new(),
             rates: DEFAULT_RATES,
@@ -120,16 +110,16 @@ pub enum NodeError {
     /// The localizer refuses its set-up.
     #[error(transparent)]
     SetUp(#[from] SetUpError),
-    /// The pose to start from cannot be.
+    /// The initial pose is refused.
     #[error(transparent)]
     Pose(#[from] PoseError),
-    /// The set that was in force is gone.
+    /// The parameter set does not load.
     #[error(transparent)]
     Set(#[from] SetError),
-    /// The network cannot be used.
+    /// The network does not start.
     #[error(transparent)]
     Network(#[from] NetworkError),
-    /// The state folder cannot be used.
+    /// The state folder does not work.
     #[error(transparent)]
     State(#[from] StateFileError),
     /// A message about the car itself does not encode, such as a map that is too large.
@@ -138,9 +128,9 @@ pub enum NodeError {
     /// A thread does not start.
     #[error("cannot start a thread: {0}")]
     Thread(#[from] std::io::Error),
-    /// The source does not know the car's first pose.
+    /// The car should start at its true pose, which the source does not know.
     #[error("the source does not know the first pose; give --initial-pose x,y,heading")]
-    NoStart,
+    NoTruth,
     /// The playback rate is not positive.
     #[error("the rate {0} is not positive")]
     Rate(f64),
@@ -173,7 +163,7 @@ const CLOSING: Duration = Duration::from_secs(2);
 const QUEUE: usize = 64;
 
 impl Node {
-    /// Starts a car. It is on the network when this returns, if there is one; else it goes on trying.
+    /// Starts a car. It is on the network when this returns, or goes on trying to join it.
     #[expect(
         clippy::too_many_lines,
         reason = "the wiring of the threads, from top to bottom, reads best in one piece"
@@ -185,7 +175,7 @@ impl Node {
             mut source,
             rate,
             set,
-            begin,
+            start,
             seed,
             connect,
             rates,
@@ -204,13 +194,13 @@ impl Node {
         let set = first_set(set, &persisted)?;
         let mount = source.mount();
         let mut localizer = set.parameters.build(&map.map, mount.base_link_from_laser, seed)?;
-        let known = match begin {
-            Begin::Pose(pose) => Some(pose),
-            Begin::Source => source.start(),
-            Begin::Global => None,
+        let known = match start {
+            Start::Pose(pose) => Some(pose),
+            Start::Truth => source.start(),
+            Start::Global => None,
         };
         set.parameters.prepare_tables(&map.map, known);
-        let begins_with_a_pose = begin_at(localizer.as_mut(), begin, source.start())?;
+        let starts_with_a_pose = start_at(localizer.as_mut(), start, source.start())?;
 
         let session = network::open(&connect)?;
         let started = wall_now();
@@ -253,7 +243,7 @@ impl Node {
         );
         let publisher = publisher.start(publisher_stops)?;
         let mut monitor = Monitor::new(thresholds, clock.now());
-        if begins_with_a_pose {
+        if starts_with_a_pose {
             monitor.on_new_pose(clock.now());
         } else {
             monitor.on_search(clock.now());
@@ -341,7 +331,7 @@ impl Node {
         })
     }
 
-    /// True when the source has delivered all it has.
+    /// True when the source has delivered everything.
     pub fn source_ended(&self) -> bool {
         self.source.is_finished()
     }
@@ -351,8 +341,8 @@ impl Node {
         &self.shared
     }
 
-    /// Ends the car: the sensors first, the network last, so that the last events still go out. Takes a few seconds at most,
-    /// whatever the link does.
+    /// Ends the car: the sensors first, the network last, so that the last events are still sent. Takes a few seconds at most,
+    /// even on a dead link.
     pub fn shutdown(self, reason: &str) {
         drop(self.stop_source);
         join(self.source);
@@ -431,12 +421,12 @@ fn first_set(wanted: Option<NamedSet>, persisted: &PersistedState) -> Result<Nam
     parameter_sets::load(name).or_else(|_| parameter_sets::load("hq"))
 }
 
-/// Gives the localizer its start. True when that is a pose.
-fn begin_at(localizer: &mut dyn Localizer, begin: Begin, start: Option<Pose>) -> Result<bool, NodeError> {
-    match begin {
-        Begin::Pose(pose) => localizer.initialize(pose)?,
-        Begin::Source => localizer.initialize(start.ok_or(NodeError::NoStart)?)?,
-        Begin::Global => {
+/// Gives the localizer its initial pose, and returns true; or starts the search of the map, and returns false.
+fn start_at(localizer: &mut dyn Localizer, start: Start, truth: Option<Pose>) -> Result<bool, NodeError> {
+    match start {
+        Start::Pose(pose) => localizer.initialize(pose)?,
+        Start::Truth => localizer.initialize(truth.ok_or(NodeError::NoTruth)?)?,
+        Start::Global => {
             localizer.relocalize();
             return Ok(false);
         }

@@ -1,4 +1,4 @@
-//! ROS 2 messages, by hand: the few that a localizer needs, decoded from CDR without a ROS installation.
+//! The ROS 2 messages that a localizer needs, decoded from CDR without a ROS installation.
 //!
 //! Layouts as in `sensor_msgs`, `nav_msgs`, `geometry_msgs` and `tf2_msgs` (the same from Foxy to Kilted).
 
@@ -72,7 +72,7 @@ impl From<Stamp> for Time {
 /// `std_msgs/Header`.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Header {
-    /// When the content was true.
+    /// The time that the content is from.
     pub stamp: Time,
     /// The frame it is in.
     pub frame_id: String,
@@ -104,7 +104,7 @@ pub struct LaserScan {
 }
 
 impl LaserScan {
-    /// The scan as the localizer takes it. `upside_down` mirrors it, for a laser mounted on its head.
+    /// The scan as the localizer takes it. `upside_down` mirrors it, for a laser that is mounted upside down.
     pub fn to_scan(&self, upside_down: bool) -> Scan {
         let sign = if upside_down { -1.0 } else { 1.0 };
         Scan {
@@ -156,7 +156,7 @@ impl Orientation {
         Self { x: 0.0, y: 0.0, z, w }
     }
 
-    /// The turn about z [rad]; NaN for the all-zero quaternion of a publisher that never set it.
+    /// The turn about z [rad]; NaN for the quaternion of zeros that a publisher sends who never sets it.
     fn yaw(self) -> f64 {
         let Self { x, y, z, w } = self;
         if x * x + y * y + z * z + w * w < 1e-6 {
@@ -176,12 +176,12 @@ pub struct RosPose {
 }
 
 impl RosPose {
-    /// The same on the ground: z, roll and pitch are dropped.
+    /// The pose on the ground, without z, roll and pitch.
     pub fn planar(&self) -> Pose {
         Pose::new(self.position.x, self.position.y, self.orientation.yaw())
     }
 
-    /// The same in space. None when it is not a transform, or one beyond any car and any track.
+    /// The pose in space. None when it is no valid transform, or larger than any track.
     pub fn spatial(&self) -> Option<Isometry3<f64>> {
         let Orientation { x, y, z, w } = self.orientation;
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-3)?;
@@ -216,9 +216,9 @@ pub type Covariance = [[f64; 6]; 6];
 pub struct RosOdometry {
     /// Time, and the frame of the pose.
     pub header: Header,
-    /// The frame that moves, and that of the twist.
+    /// The frame that moves; the twist is in it, too.
     pub child_frame_id: String,
-    /// `header.frame_id` from `child_frame_id`.
+    /// Pose of `child_frame_id` in `header.frame_id`.
     pub pose: RosPose,
     /// Covariance of the pose.
     pub pose_covariance: Covariance,
@@ -294,6 +294,15 @@ pub struct PoseWithCovarianceStamped {
     pub covariance: Covariance,
 }
 
+/// `geometry_msgs/PointStamped`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PointStamped {
+    /// Time and frame.
+    pub header: Header,
+    /// The point [m].
+    pub point: Vector3,
+}
+
 /// `geometry_msgs/TransformStamped`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct TransformStamped {
@@ -301,7 +310,7 @@ pub struct TransformStamped {
     pub header: Header,
     /// The child frame.
     pub child_frame_id: String,
-    /// `header.frame_id` from `child_frame_id`.
+    /// Pose of `child_frame_id` in `header.frame_id`.
     pub transform: RosPose,
 }
 

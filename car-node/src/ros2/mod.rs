@@ -1,4 +1,4 @@
-//! ROS 2: its messages, and publishers that a car's own nodes hear.
+//! ROS 2: its messages, and a publisher for the car's own nodes.
 
 pub mod messages;
 pub mod pose_publisher;

@@ -1,8 +1,7 @@
-//! The pose for the car's own nodes: `nav_msgs/Odometry` as a ROS 2 node under `rmw_zenoh` publishes it, so that a
-//! controller takes it like any other localizer's.
+//! Publishes the pose to the car's own nodes: `nav_msgs/Odometry`, as a ROS 2 node with `rmw_zenoh` publishes it. A controller
+//! uses it like that of any other localizer.
 //!
-//! Keys, attachment and liveliness tokens after `rmw_zenoh`'s `design.md`. A bridge routes only what DDS nodes ask for, and
-//! is not served.
+//! Keys, attachment and liveliness tokens follow `rmw_zenoh`'s `design.md`. Nothing is published behind a bridge.
 
 use std::thread::{self, JoinHandle};
 
@@ -18,19 +17,19 @@ use crate::ros2::messages::{self, Header, RosOdometry, RosPose, Vector3};
 use crate::sensors::PoseEstimate;
 use crate::sensors::clock::wall_now;
 
-/// Where the reference publishes its pose, and where controllers look for it.
+/// The topic on which the reference publishes its pose, and which controllers subscribe to.
 pub const TOPIC: &str = "/pf/pose/odom";
 
 /// The name of our node in the ROS graph.
 const NODE: &str = "synpf";
 /// The type, as keys spell it.
 const ODOMETRY: &str = "nav_msgs::msg::dds_::Odometry_";
-/// Reliable, depth 10: what a ROS node gets that asks for nothing else.
+/// Reliable, depth 10: the default of ROS nodes.
 const QOS: &str = "::,10:,:,:,,";
-/// Beliefs that wait to be sent.
+/// Estimates that wait to be sent.
 const QUEUE: usize = 8;
 
-/// The ROS side, as the sensors have shown it.
+/// The connection to the ROS side, as discovered with the sensors.
 #[derive(Debug, Clone)]
 pub struct RosConnection {
     /// A session on its router.
@@ -45,33 +44,33 @@ pub struct RosConnection {
 
 /// Declares the publisher and starts its thread, which ends when the sender is dropped.
 pub fn start(
-    side: RosConnection,
+    connection: RosConnection,
     topic: &str,
 ) -> Result<(Sender<PoseEstimate>, JoinHandle<()>), zenoh::Error> {
     let name = topic.trim_matches('/');
-    let hash = &side.odometry_hash;
-    let key = format!("{}/{name}/{ODOMETRY}/{hash}", side.domain);
-    let publisher = side
+    let hash = &connection.odometry_hash;
+    let key = format!("{}/{name}/{ODOMETRY}/{hash}", connection.domain);
+    let publisher = connection
         .session
         .declare_publisher(key)
         .congestion_control(CongestionControl::Drop)
         .priority(Priority::RealTime)
         .wait()?;
-    let zid = side.session.zid();
-    let root = format!("@ros2_lv/{}/{zid}/0", side.domain);
+    let zid = connection.session.zid();
+    let root = format!("@ros2_lv/{}/{zid}/0", connection.domain);
     let mangled = format!("%{}", name.replace('/', "%"));
     let node = format!("{root}/0/NN/%/%/{NODE}");
     let endpoint = format!("{root}/1/MP/%/%/{NODE}/{mangled}/{ODOMETRY}/{hash}/{QOS}");
     let gid = xxh3_128(endpoint.as_bytes()).to_le_bytes();
     let tokens = [node, endpoint]
         .into_iter()
-        .map(|token| side.session.liveliness().declare_token(token).wait())
+        .map(|token| connection.session.liveliness().declare_token(token).wait())
         .collect::<Result<Vec<_>, _>>()?;
     let (sender, estimates) = bounded(QUEUE);
     let publisher = RosPublisher {
         publisher,
         gid,
-        base_link: side.base_link,
+        base_link: connection.base_link,
         _tokens: tokens,
     };
     let thread = thread::Builder::new()
@@ -100,12 +99,12 @@ impl RosPublisher {
             };
             let attachment = attachment(sequence, wall_now(), &self.gid);
             if let Err(error) = self.publisher.put(payload).attachment(attachment).wait() {
-                tracing::debug!(%error, "the pose could not be sent");
+                tracing::debug!(%error, "the pose was not sent");
             }
         }
     }
 
-    /// The covariances stay zero, which in ROS means unknown.
+    /// The message for an estimate. The covariances stay zero, which means unknown in ROS.
     fn message(&self, estimate: &PoseEstimate) -> RosOdometry {
         RosOdometry {
             header: Header {
@@ -128,7 +127,7 @@ impl RosPublisher {
     }
 }
 
-/// What `rmw_zenoh` sends beside each message: number, time, and who, 33 bytes.
+/// The attachment that `rmw_zenoh` sends with each message: sequence number, time, and publisher; 33 bytes.
 fn attachment(sequence: i64, sent: Stamp, gid: &[u8; 16]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(33);
     bytes.extend(sequence.to_le_bytes());
@@ -143,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_attachment_is_what_zenohs_serializer_makes_of_it() {
+    fn an_attachment_equals_that_of_zenohs_serializer() {
         let gid = [7; 16];
         let ours = attachment(3, Stamp(1_700_000_000_000_000_001), &gid);
         let theirs = zenoh_ext::z_serialize(&(3_i64, 1_700_000_000_000_000_001_i64, gid.to_vec()));

@@ -10,6 +10,7 @@ use mcap::McapError;
 use synpf::{Odometry, Scan, Stamp, YawRate};
 
 use crate::ros2::messages::{self, CdrError, Imu, LaserScan, PoseStamped, RosOdometry, TfMessage};
+use crate::ros2::pose_publisher;
 use crate::sensors::frames::{Frames, Mount};
 
 /// One message for the localizer.
@@ -33,7 +34,7 @@ impl SensorEvent {
         }
     }
 
-    /// The same, to change it.
+    /// The message's own stamp, mutable.
     pub fn stamp_mut(&mut self) -> &mut Stamp {
         match self {
             Self::Scan(scan) => &mut scan.stamp,
@@ -52,7 +53,7 @@ pub struct Arrival {
     pub event: SensorEvent,
 }
 
-/// Which topics to take; None takes what is in the bag, the usual names first.
+/// Which topics to take; None takes the usual names, or else the first of the type.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Topics {
     /// `sensor_msgs/LaserScan`.
@@ -74,7 +75,15 @@ pub(crate) const ODOMETRY_NAMES: [&str; 4] = [
     "/odom",
 ];
 pub(crate) const TRUTH_NAMES: [&str; 1] = ["/ground_truth/odom"];
+/// Where localizers publish their poses as `nav_msgs/Odometry`, ours among them.
+const LOCALIZER_OUTPUTS: [&str; 1] = [pose_publisher::TOPIC];
 pub(crate) const IMU_NAMES: [&str; 2] = ["/sensors/imu/raw", "/imu"];
+
+/// False for a topic of type `nav_msgs/Odometry` that is known to be no wheel odometry: ground truth, and the output of a
+/// localizer, in any namespace. Such a topic is taken only if it is asked for by name.
+pub(crate) fn is_wheel_odometry(topic: &str) -> bool {
+    !TRUTH_NAMES.contains(&topic) && !LOCALIZER_OUTPUTS.iter().any(|output| topic.ends_with(output))
+}
 
 /// Why a bag cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -121,7 +130,7 @@ pub enum BagError {
     },
     /// Nothing says how the laser is mounted.
     #[error(
-        "{path}: /tf_static does not connect {base_link} with {laser}; say where the laser is with --laser x,y,heading"
+        "{path}: /tf_static does not connect {base_link} with {laser}; give the laser's pose with --laser x,y,heading"
     )]
     NoMount {
         /// The bag.
@@ -133,7 +142,7 @@ pub enum BagError {
     },
 }
 
-/// What to do about a file that is no bag.
+/// Advice for a file that does not read.
 fn advice(fault: &McapError, messages: u64) -> &'static str {
     match fault {
         McapError::BadMagic => " (`ros2 bag convert` makes one of a .db3 bag)",
@@ -153,7 +162,7 @@ enum Messages {
 }
 
 impl Messages {
-    /// Room for the messages of a schema, if it is one that we know. ROS 2 puts `msg` in the name, ROS 1 does not.
+    /// An empty list for the messages of a schema; None for other schemas. ROS 2 puts `msg` in the name, ROS 1 does not.
     fn of_schema(name: &str) -> Option<Self> {
         Some(match name.replace("/msg/", "/").as_str() {
             "sensor_msgs/LaserScan" => Self::Scan(Vec::new()),
@@ -187,7 +196,7 @@ impl Messages {
     }
 }
 
-/// A bag, read into memory as far as a localizer is concerned (about 10 MB a minute at 40 scans a second).
+/// The messages of a bag that a localizer needs, in memory (about 10 MB a minute at 40 scans a second).
 #[derive(Debug)]
 pub struct Bag {
     path: PathBuf,
@@ -197,12 +206,12 @@ pub struct Bag {
 /// Poses by the time at which they were true.
 pub type StampedPoses = Vec<(Stamp, Pose)>;
 
-/// What a localizer needs of a bag.
+/// The sensor data of a bag.
 #[derive(Debug, Clone)]
 pub struct SensorLog {
     /// Every message, in the order it arrived.
     pub arrivals: Vec<Arrival>,
-    /// Where the laser is; None when the bag does not say.
+    /// How the laser is mounted; None without `/tf_static`.
     pub mount: Option<Mount>,
     /// True poses, `map_from_base_link`, by stamp; empty when the bag has none.
     pub truth: StampedPoses,
@@ -221,10 +230,10 @@ impl SensorLog {
         Some([first, scans.next_back().unwrap_or(first)])
     }
 
-    /// Keeps the part that begins `from` after the first scan and lasts so long [s], with the odometry that leads up to its
-    /// first scan. A log without a scan stays as it is.
+    /// Keeps the part that starts `from` after the first scan and lasts `lasting` [s], with the odometry just before its first
+    /// scan. A log without a scan stays as it is.
     pub fn keep(&mut self, from: f64, lasting: f64) {
-        /// Odometry is that much older at most, or there is a gap.
+        /// Odometry this long before the part is kept [s].
         const LEAD: f64 = 0.2;
         let Some([first, _]) = self.span() else {
             return;
@@ -244,7 +253,7 @@ impl SensorLog {
 }
 
 impl Bag {
-    /// Reads a bag. Topics that no localizer needs are passed over.
+    /// Reads a bag. Topics that no localizer needs are skipped.
     pub fn read(path: &Path) -> Result<Self, BagError> {
         let open = || {
             if path.is_dir() {
@@ -298,7 +307,7 @@ impl Bag {
         &self.path
     }
 
-    /// Takes what a localizer needs. `mount` overrides what the bag says.
+    /// The sensor data. `mount` overrides `/tf_static`.
     pub fn sensors(&self, wanted: &Topics, mount: Option<Mount>) -> Result<SensorLog, BagError> {
         let (scan_topic, scans) = self
             .find(
@@ -312,7 +321,7 @@ impl Bag {
                 },
             )?
             .ok_or_else(|| self.missing("of type sensor_msgs/LaserScan"))?;
-        // Truth first, so that it does not pass for odometry.
+        // Truth first, so that it is not taken for odometry.
         let truth = self.truth(wanted.truth.as_deref())?;
         let truth_topic = truth.as_ref().map(|(topic, _)| topic.as_str());
         let (odometry_topic, odometry) = self
@@ -339,7 +348,7 @@ impl Bag {
         let upside_down = mount.is_some_and(|mount| mount.upside_down);
         let mut arrivals = Vec::with_capacity(scans.len() + odometry.len());
         let arrival = |&log_time: &Stamp, event| Arrival { log_time, event };
-        // Of messages logged at the same instant, odometry goes first: it is what carries a scan's prediction.
+        // Of messages with the same log time, odometry comes first: the prediction for a scan needs it.
         arrivals.extend(
             odometry
                 .iter()
@@ -389,7 +398,7 @@ impl Bag {
                 .map(Some)
                 .ok_or_else(|| self.missing(&format!("{name} of type {kind}")));
         }
-        let free = |topic: &str| taken != Some(topic) && !TRUTH_NAMES.contains(&topic);
+        let free = |topic: &str| taken != Some(topic) && is_wheel_odometry(topic);
         let usual = usual.iter().filter(|name| free(name));
         Ok(usual.into_iter().find_map(|name| named(name)).or_else(|| {
             self.topics

@@ -1,4 +1,4 @@
-//! A recorded drive, played as if it happened now.
+//! Plays a bag in real time.
 
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ use crate::sensors::bag::SensorLog;
 use crate::sensors::clock::SensorClock;
 use crate::sensors::frames::Mount;
 
-/// Plays a bag in the order in which it was logged.
+/// Plays the messages of a bag in the order in which they were logged.
 #[derive(Debug)]
 pub struct BagPlayer {
     path: PathBuf,

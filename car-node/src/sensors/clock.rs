@@ -4,8 +4,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use synpf::Stamp;
 
-/// Maps between the sensors' time, which a recording took in the past and a simulator makes up, and the time
-/// that everybody else lives in. A live car's two clocks are one.
+/// Converts between the sensors' time and wall time. A recording has the time at which it was made, a simulator one of its
+/// own. On a live car both are the same.
 #[derive(Debug, Clone, Copy)]
 pub struct SensorClock {
     started: Instant,
@@ -34,12 +34,12 @@ impl SensorClock {
         self.sensor.plus(self.started.elapsed().as_secs_f64() * self.rate)
     }
 
-    /// Wall time [unix] at which the sensors' clock showed, or will show, `stamp`.
+    /// Wall time [unix] at which the sensors' clock shows `stamp`.
     pub fn wall(&self, stamp: Stamp) -> Stamp {
         self.wall.plus(stamp.since(self.sensor) / self.rate)
     }
 
-    /// How long until the sensors' clock shows `stamp`; zero if it has.
+    /// Time until the sensors' clock shows `stamp`; zero if that is past.
     pub fn until(&self, stamp: Stamp) -> Duration {
         Duration::try_from_secs_f64(stamp.since(self.now()) / self.rate).unwrap_or(Duration::ZERO)
     }

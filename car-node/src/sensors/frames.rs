@@ -12,12 +12,12 @@ use crate::ros2::messages::TransformStamped;
 pub struct Mount {
     /// `base_link_from_laser`, on the ground plane.
     pub base_link_from_laser: Pose,
-    /// The laser hangs on its head: its beams turn the other way.
+    /// The laser is mounted upside down: its beams turn the other way.
     pub upside_down: bool,
 }
 
 impl Mount {
-    /// A laser that stands upright.
+    /// A laser that is mounted upright.
     pub fn upright(base_link_from_laser: Pose) -> Self {
         Self {
             base_link_from_laser,
@@ -25,27 +25,26 @@ impl Mount {
         }
     }
 
-    /// Half-way between the rear axle and the front, where the 1:10 cars that we know have it (0.27 to 0.285 m
-    /// ahead of the rear axle).
+    /// The usual place on a 1:10 car: 0.27 m ahead of the rear axle. On the cars that we know it is 0.27 to 0.285 m.
     pub fn typical() -> Self {
         Self::upright(Pose::new(0.27, 0.0, 0.0))
     }
 }
 
-/// The frames that `/tf_static` has told of, as a forest.
+/// The frames of `/tf_static`, as a forest.
 #[derive(Debug, Default)]
 pub struct Frames {
     /// Child to parent, with `parent_from_child`.
     parents: HashMap<String, (String, Isometry3<f64>)>,
 }
 
-/// ROS 1 wrote frames with a leading slash, and some drivers still do.
+/// A frame without the leading slash that ROS 1 used, and some drivers still do.
 fn bare(frame: &str) -> &str {
     frame.trim_start_matches('/')
 }
 
 impl Frames {
-    /// Adds a transform; the latest one for a child holds. Returns false for one that is no transform.
+    /// Adds a transform; the latest one of a child counts. Returns false for one that is not valid.
     pub fn insert(&mut self, transform: &TransformStamped) -> bool {
         let Some(parent_from_child) = transform.transform.spatial() else {
             return false;
@@ -62,7 +61,7 @@ impl Frames {
         self.parents.is_empty()
     }
 
-    /// The root of `frame`'s tree, with `root_from_frame`. A loop ends where it closes.
+    /// The root of `frame`'s tree, with `root_from_frame`. A loop ends after one round.
     fn root(&self, frame: &str) -> (String, Isometry3<f64>) {
         let (mut at, mut root_from_frame) = (frame.to_owned(), Isometry3::identity());
         for _ in 0..self.parents.len() {
@@ -75,7 +74,7 @@ impl Frames {
         (at, root_from_frame)
     }
 
-    /// How `laser` is mounted on `base`, through as many frames as it takes. None when nothing connects them.
+    /// How `laser` is mounted on `base`, through any number of frames. None when they are not connected.
     pub fn mount(&self, base: &str, laser: &str) -> Option<Mount> {
         let (base_root, root_from_base) = self.root(bare(base));
         let (laser_root, root_from_laser) = self.root(bare(laser));
@@ -134,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_laser_on_its_head_is_seen() {
+    fn a_laser_that_is_upside_down_is_detected() {
         let mut frames = Frames::default();
         let roll_half_turn = Orientation {
             x: 1.0,

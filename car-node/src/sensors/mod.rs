@@ -1,4 +1,4 @@
-//! Where sensor data comes from: recorded, simulated or live. One thread sends each message to the filter when it is due.
+//! Sources of sensor data: recorded, simulated or live. One thread sends each message to the filter when it is due.
 
 pub mod bag;
 mod bag_player;
@@ -32,14 +32,24 @@ pub enum Feed {
     Truth(TrueMotion),
     /// A message for the log, such as a crash.
     Log(String),
-    /// An initial pose from outside, such as from a recovery crew or `RViz`.
-    InitialPose(Pose),
+    /// An initial pose from outside the filter.
+    InitialPose {
+        /// `map_from_base_link`.
+        pose: Pose,
+        /// Where it comes from: a ROS topic, or the recovery crew of a simulated race.
+        by: String,
+    },
+    /// A request to search the whole map.
+    GlobalSearch {
+        /// Where it comes from: a ROS topic.
+        by: String,
+    },
 }
 
 /// The car's true motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrueMotion {
-    /// When it is true.
+    /// The time at which it is true.
     pub stamp: Stamp,
     /// `map_from_base_link`.
     pub pose: Pose,

@@ -226,7 +226,10 @@ fn feed(race: &Race, output: Output) -> Option<Feed> {
         Message::Scrape(crash) => Feed::Log(format!("scraped a wall at {:.1} m/s", crash.impact)),
         Message::Collision(crash) => Feed::Log(format!("touched another car at {:.1} m/s", crash.impact)),
         Message::Spin => Feed::Log("spin".into()),
-        Message::Placed(pose) => Feed::InitialPose(pose),
+        Message::Placed(pose) => Feed::InitialPose {
+            pose,
+            by: "recovery crew".into(),
+        },
         Message::Lap(_) => return None,
     })
 }

@@ -1,4 +1,4 @@
-//! Which of the topics that are heard of are the car's sensors.
+//! Discovery: chooses the car's sensors among the topics that send.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -6,32 +6,36 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::Receiver;
 use synpf::Stamp;
 
-use super::topics::{Content, Heard, Kind};
+use super::topics::{Content, Kind, TopicMessage};
 use super::{PATIENCE, Ros2Error, Ros2Options};
-use crate::sensors::bag::TRUTH_NAMES;
+use crate::sensors::bag::is_wheel_odometry;
 use crate::sensors::clock::wall_now;
 use crate::sensors::frames::{Frames, Mount};
 
-/// Once there are a scan and odometry, other topics and `/tf_static` have so long to be heard of.
+/// Discovery goes on this long after the first scan and the first odometry, for other topics and `/tf_static`.
 const LOOK_AROUND: Duration = Duration::from_secs(1);
-/// Stamps this far from this machine's time are of a clock of their own, as under `use_sim_time` [s].
+/// Stamps further than this from this machine's time belong to another clock, as with `use_sim_time` [s].
 const OTHER_CLOCK: f64 = 1.0;
 
-/// What was found of a car's topics.
-pub(super) struct Found {
+/// The topics of a car.
+pub(super) struct CarTopics {
     /// Topic and frame.
     pub(super) scan: (String, String),
     /// Topic and the frame that it moves.
     pub(super) odometry: (String, String),
+    /// The hash of the odometry's type; None behind a bridge.
     pub(super) odometry_hash: Option<String>,
     pub(super) imu: Option<String>,
     pub(super) frames: Frames,
+    /// Sensor time minus wall time [s].
     pub(super) offset: f64,
 }
 
-impl Found {
-    pub(super) fn wait(
-        heard: &Receiver<Heard>,
+impl CarTopics {
+    /// Waits until there are a scan and odometry. Calls `waiting` every second with what is missing, and gives up when it
+    /// returns false.
+    pub(super) fn discover(
+        messages: &Receiver<TopicMessage>,
         options: &Ros2Options,
         waiting: &mut impl FnMut(&str) -> bool,
     ) -> Result<Self, Ros2Error> {
@@ -40,10 +44,11 @@ impl Found {
         let mut hashes = BTreeMap::new();
         let mut frames = Frames::default();
         let mut offset = 0.0;
-        let mut whole: Option<Instant> = None;
-        let mut said = Instant::now();
+        // When there were a scan and odometry.
+        let mut sufficient: Option<Instant> = None;
+        let mut reported = Instant::now();
         loop {
-            if let Ok(Heard { topic, hash, content }) = heard.recv_timeout(PATIENCE) {
+            if let Ok(TopicMessage { topic, hash, content }) = messages.recv_timeout(PATIENCE) {
                 match content {
                     Ok(Content::Scan(scan)) => {
                         let behind = wall_now().since(Stamp::from(scan.header.stamp));
@@ -62,7 +67,7 @@ impl Found {
                             frames.insert(transform);
                         }
                     }
-                    Ok(Content::InitialPose(_)) => {}
+                    Ok(Content::InitialPose(_) | Content::ClickedPoint) => {}
                     Err(error) => tracing::warn!(%topic, %error, "a message cannot be read"),
                 }
             }
@@ -77,7 +82,7 @@ impl Found {
                 options.topics.odometry.is_some(),
             );
             if let (Some(scan), Some(odometry)) = (&scan, &odometry)
-                && whole.get_or_insert_with(Instant::now).elapsed() >= LOOK_AROUND
+                && sufficient.get_or_insert_with(Instant::now).elapsed() >= LOOK_AROUND
             {
                 let imu = choose(
                     &imus,
@@ -93,8 +98,8 @@ impl Found {
                     offset,
                 });
             }
-            if whole.is_none() && said.elapsed() >= Duration::from_secs(1) {
-                said = Instant::now();
+            if sufficient.is_none() && reported.elapsed() >= Duration::from_secs(1) {
+                reported = Instant::now();
                 let missing: Vec<_> = [(Kind::Scan, scan.is_none()), (Kind::Odometry, odometry.is_none())]
                     .into_iter()
                     .filter(|(_, missing)| *missing)
@@ -106,7 +111,7 @@ impl Found {
                         )
                     })
                     .collect();
-                let missing = format!("nothing heard yet on {}", missing.join(" and "));
+                let missing = format!("no message yet on {}", missing.join(" and "));
                 if !waiting(&missing) {
                     return Err(Ros2Error::Stopped { missing });
                 }
@@ -114,7 +119,7 @@ impl Found {
         }
     }
 
-    /// Where the laser is, and whether that is a guess.
+    /// How the laser is mounted, and true when that is a guess.
     pub(super) fn mount(&self, given: Option<Mount>) -> Result<(Mount, bool), Ros2Error> {
         if let Some(mount) = given {
             return Ok((mount, false));
@@ -133,19 +138,20 @@ impl Found {
     }
 }
 
-/// The first of `names` that is there, or, unless one was asked for, the first that is there at all. Truth is none.
+/// The first of `names` that sends. If none does and no topic was asked for, the first topic that sends, but neither ground
+/// truth nor the output of a localizer. The frame comes with it.
 pub(super) fn choose(
-    there: &BTreeMap<String, String>,
+    sending: &BTreeMap<String, String>,
     names: &[&str],
     asked: bool,
 ) -> Option<(String, String)> {
     names
         .iter()
-        .find_map(|name| there.get_key_value(*name))
+        .find_map(|name| sending.get_key_value(*name))
         .or_else(|| {
-            there
+            sending
                 .iter()
-                .find(|(topic, _)| !asked && !TRUTH_NAMES.contains(&topic.as_str()))
+                .find(|(topic, _)| !asked && is_wheel_odometry(topic))
         })
         .map(|(topic, frame)| (topic.clone(), frame.clone()))
 }
@@ -156,15 +162,15 @@ mod tests {
     use crate::sensors::bag::ODOMETRY_NAMES;
 
     #[test]
-    fn the_usual_name_is_preferred_and_truth_never_taken_for_odometry() {
-        let there = |names: &[&str]| {
+    fn the_usual_name_is_preferred_and_truth_is_no_odometry() {
+        let sending = |names: &[&str]| {
             names
                 .iter()
                 .map(|name| ((*name).to_owned(), "base_link".to_owned()))
                 .collect::<BTreeMap<_, _>>()
         };
         let name = |names: &[&str], usual: &[&str], asked| {
-            choose(&there(names), usual, asked).map(|(topic, _)| topic)
+            choose(&sending(names), usual, asked).map(|(topic, _)| topic)
         };
         let some = |name: &str| Some(name.to_owned());
         assert_eq!(name(&["/a", "/odom"], &ODOMETRY_NAMES, false), some("/odom"));
@@ -173,6 +179,12 @@ mod tests {
             some("/a")
         );
         assert_eq!(name(&["/ground_truth/odom"], &ODOMETRY_NAMES, false), None);
+        assert_eq!(
+            name(&["/pf/pose/odom", "/wheels"], &ODOMETRY_NAMES, false),
+            some("/wheels"),
+            "the output of a localizer is no odometry"
+        );
+        assert_eq!(name(&["/car2/pf/pose/odom"], &ODOMETRY_NAMES, false), None);
         assert_eq!(name(&["/a"], &["/b"], true), None, "another one was asked for");
     }
 }

@@ -1,4 +1,4 @@
-//! What is listened for, and how the ROS side names it.
+//! The topics that a car's sensors come on: types, usual names, and how zenoh keys name them.
 
 use crossbeam_channel::Sender;
 use serde::de::DeserializeOwned;
@@ -6,11 +6,11 @@ use zenoh::handlers::Callback;
 use zenoh::sample::Sample;
 
 use crate::ros2::messages::{
-    self, CdrError, Imu, LaserScan, PoseWithCovarianceStamped, RosOdometry, TfMessage,
+    self, CdrError, Imu, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, TfMessage,
 };
 use crate::sensors::bag::{IMU_NAMES, ODOMETRY_NAMES, SCAN_NAMES, Topics};
 
-/// The types that are listened for.
+/// The kinds of messages that the node subscribes to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Scan,
@@ -18,18 +18,14 @@ pub(super) enum Kind {
     Imu,
     StaticTransform,
     InitialPose,
+    ClickedPoint,
 }
 
 impl Kind {
-    pub(super) const ALL: [Self; 5] = [
-        Self::Scan,
-        Self::Odometry,
-        Self::Imu,
-        Self::StaticTransform,
-        Self::InitialPose,
-    ];
+    /// The kinds from which the car's topics are discovered. The other two have one name each.
+    pub(super) const DISCOVERED: [Self; 4] = [Self::Scan, Self::Odometry, Self::Imu, Self::StaticTransform];
 
-    /// The type as `rmw_zenoh`'s keys spell it.
+    /// The type as the keys of `rmw_zenoh` spell it.
     pub(super) fn dds_type(self) -> &'static str {
         match self {
             Self::Scan => "sensor_msgs::msg::dds_::LaserScan_",
@@ -37,6 +33,7 @@ impl Kind {
             Self::Imu => "sensor_msgs::msg::dds_::Imu_",
             Self::StaticTransform => "tf2_msgs::msg::dds_::TFMessage_",
             Self::InitialPose => "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_",
+            Self::ClickedPoint => "geometry_msgs::msg::dds_::PointStamped_",
         }
     }
 
@@ -47,18 +44,19 @@ impl Kind {
             .replace("::msg::dds_::", "/msg/")
     }
 
-    /// The topic that is wanted, or else the usual names, the preferred one first.
-    pub(super) fn names(self, wanted: &Topics) -> Vec<&str> {
-        let (wanted, usual): (_, &[&str]) = match self {
-            Self::Scan => (&wanted.scan, &SCAN_NAMES),
-            Self::Odometry => (&wanted.odometry, &ODOMETRY_NAMES),
-            Self::Imu => (&wanted.imu, &IMU_NAMES),
+    /// The topic that was asked for, or else the usual names, the preferred one first.
+    pub(super) fn names(self, asked: &Topics) -> Vec<&str> {
+        let (asked, usual): (_, &[&str]) = match self {
+            Self::Scan => (&asked.scan, &SCAN_NAMES),
+            Self::Odometry => (&asked.odometry, &ODOMETRY_NAMES),
+            Self::Imu => (&asked.imu, &IMU_NAMES),
             Self::StaticTransform => (&None, &["/tf_static"]),
             Self::InitialPose => (&None, &["/initialpose"]),
+            Self::ClickedPoint => (&None, &["/clicked_point"]),
         };
-        wanted
+        asked
             .as_deref()
-            .map_or_else(|| usual.to_vec(), |wanted| vec![wanted])
+            .map_or_else(|| usual.to_vec(), |asked| vec![asked])
     }
 
     pub(super) fn decode(self, payload: &[u8]) -> Result<Content, CdrError> {
@@ -71,11 +69,15 @@ impl Kind {
             Self::Imu => Content::Imu(of(payload)?),
             Self::StaticTransform => Content::StaticTransform(of(payload)?),
             Self::InitialPose => Content::InitialPose(of(payload)?),
+            Self::ClickedPoint => {
+                of::<PointStamped>(payload)?;
+                Content::ClickedPoint
+            }
         })
     }
 }
 
-/// A message, decoded.
+/// A decoded message.
 #[derive(Debug)]
 pub(super) enum Content {
     Scan(Box<LaserScan>),
@@ -83,35 +85,37 @@ pub(super) enum Content {
     Imu(Box<Imu>),
     StaticTransform(Box<TfMessage>),
     InitialPose(Box<PoseWithCovarianceStamped>),
+    /// Where the point is does not matter.
+    ClickedPoint,
 }
 
-/// What zenoh has brought.
+/// A message with its topic.
 #[derive(Debug)]
-pub(super) struct Heard {
+pub(super) struct TopicMessage {
     /// The ROS name, with its leading slash.
     pub(super) topic: String,
-    /// The type's hash, which `rmw_zenoh` has in its keys.
+    /// The hash of the type, which the keys of `rmw_zenoh` contain.
     pub(super) hash: Option<String>,
     pub(super) content: Result<Content, CdrError>,
 }
 
-/// Decodes in zenoh's thread and hands on; what finds the queue full is gone.
-pub(super) fn listener(kind: Kind, domain: u32, sender: &Sender<Heard>) -> Callback<Sample> {
+/// Decodes messages in zenoh's thread and queues them. A message that finds the queue full is dropped.
+pub(super) fn listener(kind: Kind, domain: u32, sender: &Sender<TopicMessage>) -> Callback<Sample> {
     let sender = sender.clone();
     Callback::from(move |sample: Sample| {
         let (topic, hash) = topic(sample.key_expr().as_str(), kind, domain);
-        // Moving transforms are of the same type.
+        // Moving transforms have the same type.
         if kind == Kind::StaticTransform && !topic.ends_with("tf_static") {
             return;
         }
         let content = kind.decode(&sample.payload().to_bytes());
-        if sender.try_send(Heard { topic, hash, content }).is_err() {
-            tracing::debug!("messages from ROS come faster than they are taken");
+        if sender.try_send(TopicMessage { topic, hash, content }).is_err() {
+            tracing::debug!("the queue is full: a message from ROS is dropped");
         }
     })
 }
 
-/// The ROS name of a key, and the hash of the type where there is one.
+/// The ROS name of a key, and the hash of the type where the key has one.
 pub(super) fn topic(key: &str, kind: Kind, domain: u32) -> (String, Option<String>) {
     let rmw = || {
         let (rest, hash) = key.strip_prefix(&format!("{domain}/"))?.rsplit_once('/')?;
@@ -121,6 +125,12 @@ pub(super) fn topic(key: &str, kind: Kind, domain: u32) -> (String, Option<Strin
         Some((name, hash)) => (format!("/{name}"), Some(hash.to_owned())),
         None => (format!("/{key}"), None),
     }
+}
+
+/// The topic `name` in the namespace of the scan: `/initialpose` for `/scan`, `/car2/initialpose` for `/car2/scan`.
+pub(super) fn in_namespace_of(scan: &str, name: &str) -> String {
+    let namespace = scan.rsplit_once('/').map_or("", |(namespace, _)| namespace);
+    format!("{namespace}{name}")
 }
 
 #[cfg(test)]
@@ -137,6 +147,16 @@ mod tests {
         assert_eq!(
             topic(humble, Kind::Odometry, 7),
             named("/odom", Some("TypeHashNotSupported"))
+        );
+    }
+
+    #[test]
+    fn a_topic_is_in_the_namespace_of_the_scan() {
+        assert_eq!(in_namespace_of("/scan", "/initialpose"), "/initialpose");
+        assert_eq!(in_namespace_of("/car2/scan", "/initialpose"), "/car2/initialpose");
+        assert_eq!(
+            in_namespace_of("/team/car2/scan", "/initialpose"),
+            "/team/car2/initialpose"
         );
     }
 }

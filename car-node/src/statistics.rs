@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-/// What is said of an error over a whole log. In the error's own unit.
+/// Summary of an error over a log, in the unit of the error.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ErrorSummary {
     /// Mean magnitude.

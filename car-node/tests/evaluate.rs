@@ -248,7 +248,7 @@ fn a_drive_is_localized_measured_and_repeatable() {
 }
 
 #[test]
-fn a_part_of_a_bag_is_taken() {
+fn a_part_of_a_bag_can_be_evaluated() {
     let folder = tempfile::tempdir().expect("folder");
     let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
     let part = ["--initial-pose", "truth", "--from", "1.5", "--for", "2", "--json"];
@@ -264,7 +264,7 @@ fn a_part_of_a_bag_is_taken() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn faults_are_named_with_their_file() {
     let folder = tempfile::tempdir().expect("folder");
     let here = folder.path();
     let (map, bag) = (write_map(here), write_bag(here));

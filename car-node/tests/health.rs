@@ -113,7 +113,7 @@ fn never_lost(outcome: &Outcome) {
 }
 
 #[test]
-fn a_sound_lap_is_localized_throughout_and_localized_is_right() {
+fn a_clean_lap_is_localized_throughout_and_localized_is_right() {
     let outcome = judge_here(&sound());
     assert_eq!(states(&outcome), [State::Converging, State::Localized]);
     let truth = outcome.state_truth.expect("truth");
@@ -122,7 +122,7 @@ fn a_sound_lap_is_localized_throughout_and_localized_is_right() {
 }
 
 #[test]
-fn a_kidnapped_car_says_lost_at_once_and_finds_itself_again() {
+fn a_kidnapped_car_is_lost_at_once_and_localized_again() {
     let sound = sound();
     let mut lost_after = Vec::new();
     for fault in ["kidnap@8+1", "kidnap@8+4", "kidnap@14+2"] {
@@ -242,7 +242,7 @@ fn a_map_that_is_out_of_date_is_no_loss() {
 }
 
 #[test]
-fn a_car_that_was_put_in_wrongly_ends_localized_where_it_is() {
+fn a_car_with_a_wrong_initial_pose_ends_localized_at_the_right_one() {
     let log = sound();
     // Across the track, as somebody may drag it on the page. The filter turns it along one way or the other first.
     let outcome = judge(&log, club().grid, Pose::new(0.0, 0.0, FRAC_PI_2));

@@ -190,7 +190,7 @@ impl Source for WithRequests {
 }
 
 #[test]
-fn requests_from_the_car_s_own_network_are_events_at_the_pit_wall() {
+fn initial_poses_and_searches_from_the_car_are_events_at_the_pit_wall() {
     let wall = Wall::open();
     let name = CarName::new("oscar").expect("a name");
     let events = wall.subscribe(&name, Topic::Event);
@@ -243,7 +243,7 @@ fn requests_from_the_car_s_own_network_are_events_at_the_pit_wall() {
 }
 
 #[test]
-fn a_car_is_seen_from_its_first_pose_to_its_end() {
+fn a_car_publishes_from_its_first_pose_to_its_end() {
     let wall = Wall::open();
     let car = CarName::new("alpha").expect("a name");
     let poses = wall.subscribe(&car, Topic::Pose);
@@ -404,7 +404,7 @@ fn a_set_put_on_the_car_survives_a_restart() {
 }
 
 #[test]
-fn rubbish_is_refused_and_the_car_drives_on() {
+fn malformed_messages_are_refused_and_the_car_drives_on() {
     let wall = Wall::open();
     let (node, car) = start_and_wait("delta", &wall, |_| ());
     let load = wall.subscribe(&car, Topic::Load);
@@ -590,7 +590,7 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
 }
 
 #[test]
-fn what_did_not_arrive_can_be_asked_for() {
+fn missing_messages_are_sent_again_on_request() {
     let wall = Wall::open();
     let (node, car) = start_and_wait("hotel", &wall, |_| ());
     let ask = |run_id: u64, ranges: Vec<[u64; 2]>| {
@@ -635,7 +635,7 @@ fn what_did_not_arrive_can_be_asked_for() {
 }
 
 #[test]
-fn a_slow_link_gets_less_and_says_so() {
+fn rates_are_lowered_on_a_slow_link_with_an_event() {
     let wall = Wall::open();
     let (node, car) = start_and_wait("golf", &wall, |_| ());
     let events = wall.subscribe(&car, Topic::Event);

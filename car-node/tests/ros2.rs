@@ -308,7 +308,7 @@ fn a_node_localizes_on_a_car_behind_a_bridge() {
 }
 
 #[test]
-fn what_is_missing_is_named_while_waiting() {
+fn missing_topics_are_named_while_waiting() {
     let (ros_router, endpoint) = router();
     let mut missing_topics = Vec::new();
     let nobody = options("tcp/127.0.0.1:1");

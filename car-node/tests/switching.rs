@@ -163,7 +163,7 @@ fn car_on_taped_tyres() -> CarSetup {
 }
 
 #[test]
-fn a_pose_goes_on_through_every_switch_of_set_on_slipping_tyres() {
+fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
     let track = Track::load(tracks.join("club"), None).expect("bundled");
     let map = Arc::new(TrackMap::new(track.grid.clone()).expect("free cells"));

@@ -106,7 +106,7 @@ fn a_faulty_description_is_refused_by_its_key_or_line_and_writes_nothing() {
 }
 
 #[test]
-fn files_that_are_missing_in_the_way_or_spoilt_are_named() {
+fn missing_existing_and_damaged_files_are_named() {
     let folder = TempDir::new().expect("a folder");
     let here = folder.path();
     fs::write(here.join("oval.yaml"), OVAL).expect("writes");

@@ -10,9 +10,9 @@ pub struct Metrics {
     pub alignment: f64,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m), smoothed [m].
     pub residual: f64,
-    /// Share of the valid beams more than 0.3 m shorter than the map says, in [0, 1].
+    /// Share of the valid beams more than 0.3 m shorter than on the map, in [0, 1].
     pub short_beams: f64,
-    /// Share of the valid beams more than 0.3 m longer than the map says, in [0, 1].
+    /// Share of the valid beams more than 0.3 m longer than on the map, in [0, 1].
     pub long_beams: f64,
     /// Share of the beams without a return, in [0, 1].
     pub no_return: f64,

@@ -10,7 +10,7 @@ use synpf::{Hypothesis, Localizer, PreparedParameters};
 pub enum LocalizerChange {
     /// The localizer takes the set and keeps its state.
     Tune(PreparedParameters),
-    /// A localizer of another kind, under its set and without a pose, goes on from where the one before was.
+    /// A localizer of another kind, with its own set and without a pose. It continues from the pose of the one before.
     Replace(Box<dyn Localizer>),
 }
 

@@ -128,7 +128,7 @@ pub enum BagError {
         /// What is in the bag.
         present: String,
     },
-    /// Nothing says how the laser is mounted.
+    /// The laser's pose is unknown.
     #[error(
         "{path}: /tf_static does not connect {base_link} with {laser}; give the laser's pose with --laser x,y,heading"
     )]

@@ -88,7 +88,7 @@ const MOST_WAITING: usize = 1024;
 const TOO_LATE: f64 = 0.5;
 
 impl Race {
-    /// A race that has not begun. `script` need not be in order.
+    /// A race before its start. `script` may be in any order.
     pub fn new(track: Track, setups: Vec<CarSetup>, seed: u64, script: Vec<ScriptedIncident>) -> Arc<Self> {
         let track = Arc::new(track);
         Arc::new(Self {

@@ -62,9 +62,9 @@ pub enum BeamClass {
     OnWall,
     /// It ends off a wall.
     OffWall,
-    /// It is much shorter than the map says.
+    /// It is much shorter than on the map.
     Short,
-    /// It is much longer than the map says.
+    /// It is much longer than on the map.
     Long,
 }
 

@@ -8,7 +8,7 @@ use rand::{Rng, RngExt, SeedableRng};
 
 /// The same dice in every run; `cargo fuzz run commands` goes on from here.
 #[test]
-fn no_command_leads_a_car_astray() {
+fn no_sequence_of_commands_breaks_a_car() {
     let mut dice = SmallRng::seed_from_u64(1);
     let mut tally = Tally::default();
     for _ in 0..150 {

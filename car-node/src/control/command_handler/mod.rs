@@ -213,7 +213,7 @@ impl CommandHandler {
         }
     }
 
-    /// Does what is due: reverts a trial that nobody confirmed, follows a proposal, publishes the set in force.
+    /// Periodic work: reverts a trial that nobody confirmed, follows a proposal, publishes the set in force.
     pub fn tick(&mut self) {
         self.revert_unconfirmed();
         self.follow_proposal();

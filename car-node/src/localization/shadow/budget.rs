@@ -1,4 +1,4 @@
-//! When the CPU is too short for a shadow. The shadow goes first: telemetry and the set in force stay as they are.
+//! Decides when there is not enough CPU for a shadow set. The shadow is dropped first; telemetry and the set in force stay.
 
 use std::collections::VecDeque;
 

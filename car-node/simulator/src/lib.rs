@@ -54,13 +54,18 @@ mod check;
 mod contact_timer;
 mod contour;
 mod driver;
+mod driver_params;
+mod estimate;
 mod generator;
 mod grip;
 mod lidar;
+mod manoeuvre;
 mod obstacle;
 mod odometry;
 mod output;
+mod pursuit;
 mod recovery_crew;
+mod speed_profile;
 mod steady_turn;
 mod tick;
 mod tire;
@@ -75,16 +80,18 @@ mod world;
 
 pub use car_setup::{CarSetup, Guidance};
 pub use check::TrackReport;
-pub use driver::{Ahead, Driver, DriverParams, Estimate, Manoeuvre};
-pub use generator::{
-    BlackStretch, Block, LineError, MappingParams, SpeedParams, TrackSpec, draw_map, minimum_curvature,
-    slowed_to, speed_profile,
-};
+pub use driver::Driver;
+pub use driver_params::DriverParams;
+pub use estimate::Estimate;
+pub use generator::{BlackStretch, Block, LineError, MappingParams, TrackSpec, draw_map, minimum_curvature};
 pub use grip::Grip;
 pub use lidar::{Lidar, LidarParams, Scan};
+pub use manoeuvre::Manoeuvre;
 pub use obstacle::Obstacle;
 pub use odometry::{Gyro, Motion, Odometry, OdometryParams, OdometrySensor, YawSource};
 pub use output::{Contact, Lap, Message, Output, Truth};
+pub use pursuit::Ahead;
+pub use speed_profile::{SpeedParams, slowed_to, speed_profile};
 pub use steady_turn::Turn;
 pub use tick::TICK;
 pub use tire::TireParams;

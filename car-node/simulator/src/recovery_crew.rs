@@ -5,7 +5,7 @@ use std::time::Duration;
 use maps::{Pose, Raceline};
 
 use crate::car::Car;
-use crate::driver::BRAKE_BEHIND;
+use crate::pursuit::BRAKE_BEHIND;
 
 /// From a crash until the crew is ready to put the car back.
 pub(crate) const RECOVERY_TIME: Duration = Duration::from_secs(3);

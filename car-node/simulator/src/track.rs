@@ -6,8 +6,7 @@ use std::path::Path;
 
 use maps::{MapError, OccupancyGrid, Raceline, read_text};
 
-use crate::generator::slowed_to;
-use crate::{SpeedParams, Walls};
+use crate::{SpeedParams, Walls, slowed_to};
 
 /// Limits of the simulated car on a line that was made for another car and whose bends may begin abruptly. They are a
 /// little lower than on its own lines. Even so, it spins on taped tyres, also on its true pose.

@@ -6,8 +6,8 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 
 use super::spline::{curve_and_knots, distance, normals};
-use super::{LineError, TrackSpec, draw_map, minimum_curvature, speed_profile};
-use crate::{Surface, Track, Wall, Walls};
+use super::{LineError, TrackSpec, draw_map, minimum_curvature};
+use crate::{Surface, Track, Wall, Walls, speed_profile};
 
 /// Distance between the points of the centre line \[m\].
 const SPACING: f64 = 0.05;

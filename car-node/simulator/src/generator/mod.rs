@@ -6,10 +6,8 @@ mod minimum_curvature;
 mod random;
 mod ring;
 mod spec;
-mod speed_profile;
 mod spline;
 
 pub use mapping::{MappingParams, draw_map};
 pub use minimum_curvature::{LineError, minimum_curvature};
 pub use spec::{BlackStretch, Block, TrackSpec};
-pub use speed_profile::{SpeedParams, slowed_to, speed_profile};

@@ -6,7 +6,8 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 
 use super::spline::{closed_curve, distance};
-use super::{MappingParams, SpeedParams, TrackSpec};
+use super::{MappingParams, TrackSpec};
+use crate::SpeedParams;
 
 /// Most tries to find a random line with room for a track.
 const TRIES: u64 = 1000;

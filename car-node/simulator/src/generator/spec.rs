@@ -3,8 +3,9 @@
 use maps::MapError;
 use serde::{Deserialize, Serialize};
 
+use super::MappingParams;
 use super::spline::distance;
-use super::{MappingParams, SpeedParams};
+use crate::SpeedParams;
 
 /// Least distance between control points \[m\].
 const CLOSEST: f64 = 0.1;

@@ -1,4 +1,4 @@
-//! The cars of the demo: of different grip, one behind another, one with an opponent ahead, and what happens to them.
+//! The cars of the demo, their opponent, and the incidents that they meet.
 
 use std::sync::Arc;
 use std::thread;
@@ -14,18 +14,18 @@ use synpf::{TablePolicy, TrackMap};
 
 use crate::Options;
 
-/// From one car to the next on the grid \[m\]: near enough for the one behind to have the other in view.
+/// Distance between cars on the grid \[m\]. Each car sees the one ahead.
 const GAP: f64 = 4.0;
 
-/// What happens repeats after this long.
+/// Period after which the incidents repeat.
 pub(crate) const ROUND: Duration = Duration::from_mins(2);
-/// When car 1 drives onto dust, and when it is off it again.
+/// Start and end of car 1's drive on dust, in each round.
 pub(crate) const DUST: [Duration; 2] = [Duration::from_secs(30), Duration::from_mins(1)];
-/// When the last car is knocked round.
+/// Time in each round at which the last car is knocked into a spin.
 pub(crate) const KNOCK: Duration = Duration::from_secs(80);
 
-/// Starts every car; the last one reaches the wall by `radio`.
-pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>> {
+/// Starts every car. The last one connects to the pit wall through the relay at `relay`.
+pub(crate) fn start(options: &Options, relay: &str) -> anyhow::Result<Vec<Node>> {
     let track = Track::find(&options.track, None)?;
     let map = RaceMap {
         name: track.name.clone(),
@@ -34,7 +34,7 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
     };
     let count = usize::from(options.cars);
     let mut setups: Vec<CarSetup> = (0..count).map(setup).collect();
-    // The last car starts behind an opponent, which nobody at the wall knows.
+    // The last car starts behind an opponent, which does not connect to the pit wall.
     let last = setups.last_mut().expect("one car at least");
     let opponent = CarSetup {
         guidance: Guidance::Truth,
@@ -46,7 +46,7 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
     };
     last.start -= GAP;
     setups.push(opponent);
-    let race = Race::new(track, setups, options.seed, script(count));
+    let race = Race::new(track, setups, options.seed, incidents(count));
     (0..count)
         .map(|index| {
             let car = CarName::new(format!("car-{}", index + 1))?;
@@ -55,13 +55,13 @@ pub(crate) fn start(options: &Options, radio: &str) -> anyhow::Result<Vec<Node>>
             config.start = Start::Truth;
             config.seed = options.seed.wrapping_add(index as u64);
             let last = index + 1 == count;
-            config.connect = vec![if last { radio } else { &options.listen }.to_owned()];
+            config.connect = vec![if last { relay } else { &options.listen }.to_owned()];
             Ok(Node::start(config)?)
         })
         .collect()
 }
 
-/// Ends every car, all at once: each may have to wait for its link.
+/// Shuts all cars down in parallel, because each may wait for its link.
 pub(crate) fn shutdown(nodes: Vec<Node>) {
     let ending: Vec<_> = nodes
         .into_iter()
@@ -69,12 +69,12 @@ pub(crate) fn shutdown(nodes: Vec<Node>) {
         .collect();
     for thread in ending {
         if thread.join().is_err() {
-            tracing::error!("a car did not end well");
+            tracing::error!("a car panicked while shutting down");
         }
     }
 }
 
-/// Car 2 has taped tyres and an odometry that knows its turning from the steering alone; the others grip.
+/// Car 2 has taped tyres, and odometry that takes the yaw rate from the steering. The others have good grip.
 fn setup(index: usize) -> CarSetup {
     let mut setup = CarSetup {
         start: -GAP * (index + 1) as f64,
@@ -90,8 +90,8 @@ fn setup(index: usize) -> CarSetup {
     setup
 }
 
-/// What happens to the cars. The radio has a plan of its own.
-fn script(cars: usize) -> Vec<ScriptedIncident> {
+/// The incidents of two hours. The radio has its own schedule.
+fn incidents(cars: usize) -> Vec<ScriptedIncident> {
     (0..60)
         .flat_map(|round| {
             let incident = |at, car, incident| ScriptedIncident {

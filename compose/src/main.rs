@@ -1,5 +1,4 @@
-//! Three cars and a pit wall in one process: what the whole does, without a car, without Docker, without
-//! internet.
+//! The demo: three simulated cars and a pit wall in one process. It needs no car, no Docker and no internet.
 
 mod cars;
 mod radio;
@@ -27,10 +26,10 @@ struct Options {
     #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
     params: String,
     /// Seed of the race.
-    #[arg(long, value_name = "N", default_value_t = 1, allow_negative_numbers = true, value_parser = show::seed)]
+    #[arg(long, value_name = "N", default_value_t = 1, allow_negative_numbers = true, value_parser = show::parse_seed)]
     seed: u64,
     /// End after this long, such as 30s or 5m; without it, Ctrl-C ends the demo.
-    #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = show::duration)]
+    #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = show::parse_duration)]
     time: Option<Duration>,
     /// Where the pit wall listens for cars.
     #[arg(long, value_name = "ENDPOINT", default_value = pitwall::LOCAL_PITWALL)]
@@ -54,7 +53,7 @@ fn main() -> ExitCode {
     match run(&Options::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            show::complain(&error);
+            show::print_error(&error);
             ExitCode::FAILURE
         }
     }
@@ -79,13 +78,13 @@ fn run(options: &Options) -> anyhow::Result<()> {
         .context(
             "if another pit wall runs here, give --listen tcp/127.0.0.1:PORT and --page 127.0.0.1:PORT",
         )?;
-    let radio = runtime.block_on(radio::start(&options.listen))?;
-    let nodes = cars::start(options, &radio)?;
+    let relay = runtime.block_on(radio::start(&options.listen))?;
+    let nodes = cars::start(options, &relay)?;
     let shown = show::banner(options, pitwall.url())
-        .and_then(|()| runtime.block_on(show::until_the_end(pitwall.service(), options.time, options.json)));
+        .and_then(|()| runtime.block_on(show::run(pitwall.service(), options.time, options.json)));
     cars::shutdown(nodes);
     runtime.block_on(pitwall.stop());
-    // Nobody reads on: the demo ends quietly.
+    // A closed pipe is no error: the reader has ended.
     match shown {
         Err(error) if show::is_closed_pipe(&error) => Ok(()),
         shown => shown,

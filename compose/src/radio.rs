@@ -1,4 +1,4 @@
-//! The radio of one car: a relay on this machine that falls silent now and then, as one does behind a grandstand.
+//! The radio link of one car: a TCP relay that is cut in every round, as behind a grandstand.
 
 use std::time::Duration;
 
@@ -9,32 +9,32 @@ use tokio::time::{Instant, sleep_until};
 
 use crate::cars::ROUND;
 
-/// When in each round the radio falls silent, and for how long.
-pub(crate) const SILENT: [Duration; 2] = [Duration::from_secs(100), Duration::from_secs(6)];
+/// Start and end of the outage in each round.
+pub(crate) const OUTAGE: [Duration; 2] = [Duration::from_secs(100), Duration::from_secs(106)];
 
-/// Starts a relay to the wall that listens at `wall` (such as `tcp/127.0.0.1:7447`). Returns the endpoint for the car to
-/// dial. Must be called on the runtime, and ends with it.
-pub(crate) async fn start(wall: &str) -> anyhow::Result<String> {
-    let address = wall
+/// Starts a relay to the pit wall that listens at `pitwall` (such as `tcp/127.0.0.1:7447`). Returns the endpoint for the
+/// car to connect to. The relay runs on the current tokio runtime, and ends with it.
+pub(crate) async fn start(pitwall: &str) -> anyhow::Result<String> {
+    let address = pitwall
         .strip_prefix("tcp/")
         .and_then(|rest| rest.split(['?', '#']).next())
-        .with_context(|| format!("--listen {wall}: the demo's radio needs tcp/ADDRESS:PORT"))?
+        .with_context(|| format!("--listen {pitwall}: the demo's radio needs tcp/ADDRESS:PORT"))?
         .to_owned();
     let listener = TcpListener::bind("127.0.0.1:0").await?;
     let endpoint = format!("tcp/{}", listener.local_addr()?);
-    let (switch, silent) = watch::channel(false);
-    tokio::spawn(schedule(switch));
-    tokio::spawn(relay(listener, address, silent));
+    let (set_cut, cut) = watch::channel(false);
+    tokio::spawn(schedule(set_cut));
+    tokio::spawn(relay(listener, address, cut));
     Ok(endpoint)
 }
 
-/// Silences the radio in every round.
-async fn schedule(switch: watch::Sender<bool>) {
+/// Cuts and restores the link in every round.
+async fn schedule(set_cut: watch::Sender<bool>) {
     let mut round = Instant::now();
     loop {
-        for (after, silent) in [(SILENT[0], true), (SILENT[0] + SILENT[1], false)] {
+        for (after, cut) in [(OUTAGE[0], true), (OUTAGE[1], false)] {
             sleep_until(round + after).await;
-            if switch.send(silent).is_err() {
+            if set_cut.send(cut).is_err() {
                 return;
             }
         }
@@ -42,24 +42,24 @@ async fn schedule(switch: watch::Sender<bool>) {
     }
 }
 
-/// Passes bytes on in both directions while the radio is on; silence cuts every connection.
-async fn relay(listener: TcpListener, wall: String, silent: watch::Receiver<bool>) {
+/// Copies bytes in both directions. While the link is cut, it closes every connection.
+async fn relay(listener: TcpListener, pitwall: String, cut: watch::Receiver<bool>) {
     while let Ok((mut car, _)) = listener.accept().await {
-        let (wall, mut silent) = (wall.clone(), silent.clone());
+        let (pitwall, mut cut) = (pitwall.clone(), cut.clone());
         tokio::spawn(async move {
-            if *silent.borrow() {
+            if *cut.borrow() {
                 return;
             }
-            let Ok(mut there) = TcpStream::connect(wall).await else {
+            let Ok(mut server) = TcpStream::connect(pitwall).await else {
                 return;
             };
-            // Small messages must not wait for company.
-            if car.set_nodelay(true).and(there.set_nodelay(true)).is_err() {
+            // Small messages must not wait for more bytes.
+            if car.set_nodelay(true).and(server.set_nodelay(true)).is_err() {
                 return;
             }
             tokio::select! {
-                _ = tokio::io::copy_bidirectional(&mut car, &mut there) => {}
-                _ = silent.wait_for(|silent| *silent) => {}
+                _ = tokio::io::copy_bidirectional(&mut car, &mut server) => {}
+                _ = cut.wait_for(|cut| *cut) => {}
             }
         });
     }
@@ -71,33 +71,33 @@ mod tests {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
     #[tokio::test]
-    async fn silence_cuts_the_link_and_the_next_try_gets_through() {
-        let wall = TcpListener::bind("127.0.0.1:0").await.expect("a port");
-        let wall_address = wall.local_addr().expect("bound").to_string();
+    async fn an_outage_closes_connections_and_a_new_one_works_afterwards() {
+        let pitwall = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+        let pitwall_address = pitwall.local_addr().expect("bound").to_string();
         let radio = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let radio_address = radio.local_addr().expect("bound");
-        let (switch, silent) = watch::channel(false);
-        tokio::spawn(relay(radio, wall_address, silent));
+        let (set_cut, cut) = watch::channel(false);
+        tokio::spawn(relay(radio, pitwall_address, cut));
         let within = |work| tokio::time::timeout(Duration::from_secs(20), work);
 
         within(Box::pin(async {
             let mut car = TcpStream::connect(radio_address).await.expect("the radio");
             car.write_all(b"pose").await.expect("sent");
-            let (mut there, _) = wall.accept().await.expect("the car");
-            let mut heard = [0; 4];
-            there.read_exact(&mut heard).await.expect("heard");
-            assert_eq!(&heard, b"pose");
-            switch.send(true).expect("a relay");
-            // Both ends learn of it.
-            assert_eq!(there.read(&mut heard).await.unwrap_or(0), 0);
-            assert_eq!(car.read(&mut heard).await.unwrap_or(0), 0);
-            switch.send(false).expect("a relay");
+            let (mut server, _) = pitwall.accept().await.expect("the car");
+            let mut received = [0; 4];
+            server.read_exact(&mut received).await.expect("received");
+            assert_eq!(&received, b"pose");
+            set_cut.send(true).expect("a relay");
+            // Both ends see their connection closed.
+            assert_eq!(server.read(&mut received).await.unwrap_or(0), 0);
+            assert_eq!(car.read(&mut received).await.unwrap_or(0), 0);
+            set_cut.send(false).expect("a relay");
             let mut again = TcpStream::connect(radio_address).await.expect("the radio");
             again.write_all(b"pose").await.expect("sent");
-            let (mut there, _) = wall.accept().await.expect("the car again");
-            there.read_exact(&mut heard).await.expect("heard");
+            let (mut server, _) = pitwall.accept().await.expect("the car again");
+            server.read_exact(&mut received).await.expect("received");
         }))
         .await
-        .expect("in time");
+        .expect("within the deadline");
     }
 }

@@ -10,26 +10,26 @@ use protocol::Severity;
 use crate::Options;
 use crate::{cars, radio};
 
-/// How often the cars are listed.
-const LIST: Duration = Duration::from_secs(10);
-/// How often news and JSON are written.
+/// Period of the table of cars.
+const TABLE_PERIOD: Duration = Duration::from_secs(10);
+/// Period of log entries and of JSON lines.
 const TICK: Duration = Duration::from_secs(1);
 
-/// Writes a line to stdout.
-fn say(line: &str) -> io::Result<()> {
+/// Writes a line to stdout and flushes it.
+fn print_line(line: &str) -> io::Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "{line}")?;
     out.flush()
 }
 
-/// Whether the demo ended because nobody reads what it prints, as after `| head`.
+/// True if stdout was closed by its reader, as by `| head`.
 pub(crate) fn is_closed_pipe(error: &anyhow::Error) -> bool {
     error
         .downcast_ref::<io::Error>()
         .is_some_and(|error| error.kind() == ErrorKind::BrokenPipe)
 }
 
-/// Says what to look at.
+/// Prints where the page is, commands to try, and the schedule of incidents.
 pub(crate) fn banner(options: &Options, url: &str) -> anyhow::Result<()> {
     if options.json {
         return Ok(());
@@ -39,44 +39,44 @@ pub(crate) fn banner(options: &Options, url: &str) -> anyhow::Result<()> {
     let events = [
         (
             cars::DUST[0],
-            "car-1 drives onto dust: slip and the distance to its line grow, the pose stays good".to_owned(),
+            "car-1 drives onto dust: slip and lateral error grow, the pose stays good".to_owned(),
         ),
         (cars::DUST[1], "car-1 is off the dust again".to_owned()),
         (
             cars::KNOCK,
-            format!("car-{last} is knocked round: it turns, and is localized on"),
+            format!("car-{last} is knocked into a spin; it turns round and stays localized"),
         ),
         (
-            radio::SILENT[0],
-            format!("car-{last}'s radio falls silent: BLIND at the wall, then its gaps fill"),
+            radio::OUTAGE[0],
+            format!("car-{last}'s radio link is cut: the pit wall shows BLIND"),
         ),
         (
-            radio::SILENT[0] + radio::SILENT[1],
-            format!("car-{last}'s radio is back"),
+            radio::OUTAGE[1],
+            format!("car-{last}'s radio link is back: the gaps in its telemetry are filled"),
         ),
     ];
     let taped = if options.cars > 1 {
-        "car-2 has taped tyres: it slips all the time. "
+        "car-2 has taped tyres and slips all the time. "
     } else {
         ""
     };
     let events = events
         .map(|(at, what)| format!("  {}  {what}", clock(at)))
         .join("\n");
-    say(&format!(
+    print_line(&format!(
         "{} cars race on {}; the pit wall listens at {}.
 
 Open the page:  {url}
 
 Or look at it from another terminal:
-  pitwall cars                         who is localized, and who is not, and why
-  pitwall watch car-1                  one car, live
-  pitwall params car-1 select lq       another parameter set, on the running car
+  pitwall cars                         state of each car, with causes
+  pitwall watch car-1                  live view of one car
+  pitwall params car-1 select lq       switch the parameter set of a running car
   pitwall record -o race.mcap --for 30s
 (cargo run --release -p pitwall -- cars, and so on.)
 
-{taped}An opponent drives ahead of car-{last}, and stands in its scans.
-What happens, in every round of {}:
+{taped}An opponent drives ahead of car-{last} and blocks part of its scans.
+Incidents (minutes:seconds), repeated every {}:
 {events}
 Ctrl-C ends the demo.
 ",
@@ -88,46 +88,42 @@ Ctrl-C ends the demo.
     Ok(())
 }
 
-/// Says why the demo failed.
-pub(crate) fn complain(error: &anyhow::Error) {
+/// Writes an error to stderr.
+pub(crate) fn print_error(error: &anyhow::Error) {
     eprintln!("demo: {error:#}");
 }
 
-/// Shows what happens until the time is over or somebody presses Ctrl-C.
-pub(crate) async fn until_the_end(
-    service: &FleetService,
-    time: Option<Duration>,
-    json: bool,
-) -> anyhow::Result<()> {
-    let over = async {
+/// Prints log entries and tables until `time` is over or Ctrl-C.
+pub(crate) async fn run(service: &FleetService, time: Option<Duration>, json: bool) -> anyhow::Result<()> {
+    let timeout = async {
         match time {
             Some(time) => tokio::time::sleep(time).await,
             None => std::future::pending().await,
         }
     };
     tokio::select! {
-        result = show(service, json) => result,
-        () = over => Ok(()),
+        result = print_updates(service, json) => result,
+        () = timeout => Ok(()),
         result = tokio::signal::ctrl_c() => Ok(result?),
     }
 }
 
-async fn show(service: &FleetService, json: bool) -> anyhow::Result<()> {
+async fn print_updates(service: &FleetService, json: bool) -> anyhow::Result<()> {
     let mut ticks = tokio::time::interval(TICK);
-    let (mut seen, mut list_due) = (0, tokio::time::Instant::now() + LIST);
+    let (mut last_entry, mut table_due) = (0, tokio::time::Instant::now() + TABLE_PERIOD);
     loop {
         ticks.tick().await;
-        let (cars, news) = {
+        let (cars, entries) = {
             let fleet = service.fleet();
-            let news: Vec<_> = fleet.log().since(seen).cloned().collect();
-            seen = fleet.log().last();
-            (fleet.view(unix_now()), news)
+            let entries: Vec<_> = fleet.log().since(last_entry).cloned().collect();
+            last_entry = fleet.log().last();
+            (fleet.view(unix_now()), entries)
         };
         if json {
-            say(&serde_json::to_string(&cars)?)?;
+            print_line(&serde_json::to_string(&cars)?)?;
             continue;
         }
-        for entry in news {
+        for entry in entries {
             let mark = match entry.severity {
                 Severity::Info => " ",
                 Severity::Warning => "!",
@@ -135,17 +131,17 @@ async fn show(service: &FleetService, json: bool) -> anyhow::Result<()> {
             };
             let car = entry.car.map_or_else(String::new, |car| car.to_string());
             let who = entry.who.map_or_else(String::new, |who| format!(" ({who})"));
-            say(&format!("{mark} {car:<8} {}{who}", entry.text))?;
+            print_line(&format!("{mark} {car:<8} {}{who}", entry.text))?;
         }
-        if tokio::time::Instant::now() >= list_due {
-            list_due += LIST;
-            say(&list(&cars))?;
+        if tokio::time::Instant::now() >= table_due {
+            table_due += TABLE_PERIOD;
+            print_line(&table(&cars))?;
         }
     }
 }
 
-/// The cars, a line each.
-fn list(cars: &[CarView]) -> String {
+/// A table with a line for each car.
+fn table(cars: &[CarView]) -> String {
     let mut text = format!(
         "\n  {:<8} {:<13} {:<9} {:>5} {:>8} {:>8} {:>7} {:>7}",
         "car", "state", "set", "lap", "last s", "speed", "align", "age ms"
@@ -172,24 +168,25 @@ fn list(cars: &[CarView]) -> String {
     text + "\n"
 }
 
-/// `30s`, `5m`, or plain seconds.
-pub(crate) fn duration(text: &str) -> Result<Duration, String> {
+/// Parses `30s`, `5m`, `2h`, or a number of seconds.
+pub(crate) fn parse_duration(text: &str) -> Result<Duration, String> {
     let (number, unit) = text.split_at(text.find(|c: char| c.is_alphabetic()).unwrap_or(text.len()));
     let number: f64 = number
         .parse()
-        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
+        .map_err(|_| format!("{text:?} is not a duration; use 30s or 5m"))?;
     let scale = match unit {
         "" | "s" => 1.0,
         "m" | "min" => 60.0,
         "h" => 3600.0,
         _ => return Err(format!("unknown unit {unit:?}; use s, m or h")),
     };
-    Duration::try_from_secs_f64(number * scale).map_err(|_| "a time is 0 s or more".to_owned())
+    Duration::try_from_secs_f64(number * scale).map_err(|_| "a duration is 0 s or more".to_owned())
 }
 
-pub(crate) fn seed(text: &str) -> Result<u64, String> {
+/// Parses a seed.
+pub(crate) fn parse_seed(text: &str) -> Result<u64, String> {
     text.parse()
-        .map_err(|_| format!("wanted is a whole number from 0 to {}", u64::MAX))
+        .map_err(|_| format!("the seed must be a whole number from 0 to {}", u64::MAX))
 }
 
 #[cfg(test)]
@@ -197,12 +194,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_parse_or_say_what_is_wrong() {
-        assert_eq!(duration("30s"), Ok(Duration::from_secs(30)));
-        assert_eq!(duration("1.5m"), Ok(Duration::from_secs(90)));
-        assert_eq!(duration("2"), Ok(Duration::from_secs(2)));
+    fn durations_parse_or_are_refused() {
+        assert_eq!(parse_duration("30s"), Ok(Duration::from_secs(30)));
+        assert_eq!(parse_duration("1.5m"), Ok(Duration::from_secs(90)));
+        assert_eq!(parse_duration("2"), Ok(Duration::from_secs(2)));
         for text in ["", "s", "-1s", "1y", "NaN"] {
-            assert!(duration(text).is_err(), "{text}");
+            assert!(parse_duration(text).is_err(), "{text}");
         }
     }
 }

@@ -131,26 +131,26 @@ impl CauseKind {
     pub fn words(self) -> &'static str {
         match self {
             Self::NoInitialPose => "no initial pose",
-            Self::NewPose => "new pose, not yet confirmed by motion",
-            Self::Alignment => "scan off the walls: alignment",
-            Self::Residual => "scan off the walls: residual",
-            Self::LongBeams => "beams through walls",
-            Self::Occluded => "view blocked by opponents",
+            Self::NewPose => "new pose not yet confirmed by motion",
+            Self::Alignment => "end points off the walls: alignment",
+            Self::Residual => "end points off the walls: residual",
+            Self::LongBeams => "beams longer than in the map",
+            Self::Occluded => "beams shorter than in the map",
             Self::NoReturn => "beams without return",
-            Self::EffectiveSampleSize => "few effective particles",
-            Self::Likelihood => "scans fit worse than usual",
-            Self::SpreadAlong => "unsure along the track",
-            Self::SpreadAcross => "unsure across the track",
-            Self::SecondMode => "a second place fits",
+            Self::EffectiveSampleSize => "low effective sample size",
+            Self::Likelihood => "scan likelihood lower than usual",
+            Self::SpreadAlong => "pose uncertain along the track",
+            Self::SpreadAcross => "pose uncertain across the track",
+            Self::SecondMode => "second pose hypothesis",
             Self::Slip => "wheels slip",
-            Self::YawRate => "odometry's yaw rate is off",
-            Self::Innovation => "pose corrected by a jump",
-            Self::Age => "poses late",
+            Self::YawRate => "wrong odometry yaw rate",
+            Self::Innovation => "large pose correction",
+            Self::Age => "poses published late",
             Self::NoScan => "no scans",
             Self::NoOdometry => "no odometry",
             Self::BadSensorData => "bad sensor data",
-            Self::Searching => "searching the map",
-            Self::OdometryJump => "odometry has jumped",
+            Self::Searching => "searching the whole map",
+            Self::OdometryJump => "odometry jump",
         }
     }
 
@@ -170,7 +170,7 @@ impl CauseKind {
 }
 
 impl fmt::Display for Cause {
-    /// `scan off the walls: alignment 0.41 (limit 0.45)`
+    /// `end points off the walls: alignment 0.41 (limit 0.45)`
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.kind.words())?;
         let unit = self.kind.unit();
@@ -294,7 +294,7 @@ mod tests {
         };
         assert_eq!(
             cause(CauseKind::SpreadAlong, Some(0.52), Some(0.4)),
-            "unsure along the track 0.52 m (limit 0.40 m)"
+            "pose uncertain along the track 0.52 m (limit 0.40 m)"
         );
         assert_eq!(cause(CauseKind::NoInitialPose, None, None), "no initial pose");
     }

@@ -314,7 +314,7 @@ async fn invalid_commands_are_refused_and_change_nothing() {
         (select("wet"), "no set"),
         (
             Action::Params(ParamsAction::Delete { name: "hq".into() }),
-            "ships",
+            "built in",
         ),
         (Action::Params(ParamsAction::Confirm), "nothing to confirm"),
         (Action::Pose(far), "off the map"),

@@ -149,7 +149,7 @@ async fn each_outcome_has_its_exit_code_and_text() {
         (&["params", "car-1", "confirm"], 0, &["done"]),
         (&["params", "car-1", "revert"], 0, &["set in force is lq"]),
         (&["params", "car-1", "delete", "mine"], 0, &["done"]),
-        (&["params", "car-1", "delete", "hq"], 3, &["ships"]),
+        (&["params", "car-1", "delete", "hq"], 3, &["built in"]),
         (
             &["params", "car-1", "put", &bad],
             3,

@@ -162,7 +162,7 @@ fn events_of_older_versions_are_read() {
         (
             "10000000".to_owned(),
             EventKind::Warning {
-                text: "telemetry rates changed; this version of the car did not say how".into(),
+                text: "telemetry rates changed; the car's version does not send how".into(),
             },
         ),
         (

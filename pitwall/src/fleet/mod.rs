@@ -320,6 +320,54 @@ mod tests {
         assert_eq!(said, ["BLIND: nothing comes from the car", "link is back"]);
     }
 
+    /// The page greys a car whose view is blind. It may show that within 3 s of the last message, so the fleet must know it
+    /// well before.
+    #[test]
+    fn a_silent_car_is_blind_well_within_three_seconds() {
+        const TENTH: i64 = SECOND / 10;
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        // Health at 10 Hz for 5 s, then nothing.
+        let last = 50 * TENTH;
+        for i in 0..=50 {
+            fleet.apply(&health(i * TENTH, i as u64 + 1, Delivery::Live, State::Localized));
+            fleet.tick(i * TENTH);
+            assert!(!fleet.view(i * TENTH)[0].blind, "at {i} tenths of a second");
+        }
+        for i in 1..=30 {
+            let now = last + i * TENTH;
+            fleet.tick(now);
+            let view = &fleet.view(now)[0];
+            assert_eq!(
+                view.blind,
+                i > 10,
+                "{i} tenths of a second after the last message"
+            );
+            assert_eq!(view.state == "BLIND", view.blind);
+        }
+        let alarms: Vec<_> = fleet
+            .log()
+            .since(0)
+            .map(|entry| (entry.at, entry.severity))
+            .collect();
+        assert_eq!(alarms, [(last + 11 * TENTH, Severity::Critical)]);
+    }
+
+    #[test]
+    fn a_car_whose_liveliness_token_ends_is_blind_at_once() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        let last = 5 * SECOND;
+        fleet.apply(&health(last, 1, Delivery::Live, State::Localized));
+        let vanished = FleetEvent {
+            payload: EventPayload::Vanished,
+            ..appeared(last + 1)
+        };
+        fleet.apply(&vanished);
+        assert_eq!(fleet.view(last + 1)[0].state, "BLIND");
+        assert_eq!(fleet.log().alarms(), 1);
+    }
+
     #[test]
     fn an_alarm_stays_until_it_is_acknowledged() {
         let mut fleet = Fleet::default();

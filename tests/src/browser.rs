@@ -1,4 +1,4 @@
-//! A headless Chromium, driven through its driver.
+//! A headless Chromium, controlled through WebDriver.
 
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -11,10 +11,10 @@ use fantoccini::{Client, ClientBuilder, Locator};
 use hyper_util::client::legacy::connect::HttpConnector;
 use serde_json::{Value, json};
 
-/// How long the browser may take: starting it on a busy machine without a graphics card does take its time.
-const PATIENCE: Duration = Duration::from_secs(90);
+/// How long the browser may take to start, and a condition on the page to hold. It is long, because machines may be busy.
+const DEADLINE: Duration = Duration::from_secs(90);
 
-/// A browser with one page. Dropping it ends it.
+/// A browser with one page. Dropping it ends the process.
 pub struct Browser {
     client: Client,
     driver: Child,
@@ -22,8 +22,8 @@ pub struct Browser {
 }
 
 impl Browser {
-    /// Opens `url` in a fresh browser whose page is `width` times `height` pixels large, and keeps a log of its console
-    /// and of every request.
+    /// Opens `url` in a new browser whose viewport has `width` times `height` pixels. The console and all requests are
+    /// logged.
     pub async fn open(url: &str, width: u32, height: u32) -> Self {
         Self::start(
             url,
@@ -34,8 +34,8 @@ impl Browser {
         .await
     }
 
-    /// The same without a log: that of the network repeats every snapshot, which a measurement would measure.
-    pub async fn open_unwatched(url: &str, width: u32, height: u32) -> Self {
+    /// As [`Self::open`], without logs. The network log contains every snapshot, which would disturb measurements.
+    pub async fn open_without_logs(url: &str, width: u32, height: u32) -> Self {
         Self::start(url, width, height, json!({})).await
     }
 
@@ -44,7 +44,7 @@ impl Browser {
             .rsplit_once(':')
             .map(|(_, port)| port.to_owned())
             .expect("a port");
-        // A process group of its own: what the driver starts must not outlive the test.
+        // The driver gets its own process group, so that everything it starts can be ended.
         let driver = Command::new("chromedriver")
             .arg(format!("--port={port}"))
             .stdin(Stdio::null())
@@ -75,7 +75,7 @@ impl Browser {
         let mut builder = ClientBuilder::new(HttpConnector::new());
         builder.capabilities(capabilities.as_object().cloned().expect("an object"));
         let driver_url = format!("http://127.0.0.1:{port}");
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + DEADLINE;
         let client = loop {
             match builder.connect(&driver_url).await {
                 Ok(client) => break client,
@@ -93,43 +93,43 @@ impl Browser {
         browser
     }
 
-    /// Makes the page `width` times `height` pixels large.
+    /// Sets the viewport to `width` times `height` pixels.
     pub async fn resize(&self, width: u32, height: u32) {
         let metrics = json!({"width": width, "height": height, "deviceScaleFactor": 1, "mobile": false});
-        self.own(
+        self.driver_command(
             "goog/cdp/execute",
             json!({"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics}),
         )
         .await;
     }
 
-    /// Runs `return SCRIPT` on the page.
-    pub async fn ask(&self, script: &str) -> Value {
+    /// Evaluates a JavaScript expression on the page.
+    pub async fn evaluate(&self, script: &str) -> Value {
         self.client
             .execute(&format!("return {script}"), Vec::new())
             .await
             .unwrap_or_else(|error| panic!("{script}: {error}"))
     }
 
-    /// Waits until the script gives something other than null, false, 0 and "", and returns that.
+    /// Waits until an expression is truthy, and returns its value. `what` describes the condition.
     pub async fn wait(&self, what: &str, script: &str) -> Value {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + DEADLINE;
         loop {
-            let value = self.ask(&format!("({script}) || null")).await;
+            let value = self.evaluate(&format!("({script}) || null")).await;
             if !value.is_null() {
                 return value;
             }
             if Instant::now() >= deadline {
                 let cards = self
-                    .ask("[...document.querySelectorAll('.card')].map((c) => c.innerText)")
+                    .evaluate("[...document.querySelectorAll('.card')].map((c) => c.innerText)")
                     .await;
-                panic!("not within {PATIENCE:?}: {what}\n{script}\nthe cards say {cards:#}");
+                panic!("not within {DEADLINE:?}: {what}\n{script}\ncards: {cards:#}");
             }
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     }
 
-    /// Clicks what `css` finds.
+    /// Clicks the first element that matches `css`.
     pub async fn click(&self, css: &str) {
         let element = self.client.find(Locator::Css(css)).await;
         let element = element.unwrap_or_else(|error| panic!("{css}: {error}"));
@@ -139,23 +139,24 @@ impl Browser {
             .unwrap_or_else(|error| panic!("click on {css}: {error}"));
     }
 
-    /// Types into what `css` finds, in place of what is there.
+    /// Replaces the text of the input that matches `css`, and presses Enter.
     pub async fn fill(&self, css: &str, text: &str) {
         let element = self.client.find(Locator::Css(css)).await;
         let element = element.unwrap_or_else(|error| panic!("{css}: {error}"));
-        // The driver's own clearing counts as a change of its own.
+        // Clearing through the driver would fire a change event.
         let empty = format!("(document.querySelector('{css}').value = '')");
-        self.ask(&empty).await;
+        self.evaluate(&empty).await;
         element.send_keys(&format!("{text}\n")).await.expect("typed");
     }
 
-    /// Types a key on the page.
+    /// Sends a key press to the page.
     pub async fn key(&self, key: &str) {
         let event = format!("new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}})");
-        self.ask(&format!("document.body.dispatchEvent({event})")).await;
+        self.evaluate(&format!("document.body.dispatchEvent({event})"))
+            .await;
     }
 
-    /// Presses at one point of the page, moves to another and lets go \[px\].
+    /// Drags the mouse from one point of the page to another \[px\].
     pub async fn drag(&self, from: [f64; 2], to: [f64; 2]) {
         let move_to = |[x, y]: [f64; 2]| PointerAction::MoveTo {
             duration: Some(Duration::from_millis(50)),
@@ -174,23 +175,23 @@ impl Browser {
         self.client.perform_actions(drag).await.expect("dragged");
     }
 
-    /// Keeps a picture of the page.
-    pub async fn picture(&self, name: &str) -> PathBuf {
+    /// Saves a screenshot as `NAME.png` in the folder that `PITWALL_CI_OUTPUT` names, else in the folder for temporary files.
+    pub async fn screenshot(&self, name: &str) -> PathBuf {
         let folder = std::env::var_os("PITWALL_CI_OUTPUT").map_or_else(std::env::temp_dir, PathBuf::from);
-        std::fs::create_dir_all(&folder).expect("a folder for pictures");
-        let png = self.client.screenshot().await.expect("a picture");
+        std::fs::create_dir_all(&folder).expect("a folder for screenshots");
+        let png = self.client.screenshot().await.expect("a screenshot");
         let file = folder.join(format!("{name}.png"));
         std::fs::write(&file, png).expect("written");
         file
     }
 
-    /// Fails if the console has an error or a warning, or the page asked anybody but `origin` for anything.
+    /// Fails if the console has an error or a warning, or if the page sent a request to another origin.
     pub async fn expect_clean(&self, origin: &str) {
         let console = self.log("browser").await;
         let bad = |entry: &&Value| entry["level"] == "SEVERE" || entry["level"] == "WARNING";
         let bad: Vec<_> = console.iter().filter(bad).collect();
-        assert!(bad.is_empty(), "the console says {bad:#?}");
-        let mut own = 0;
+        assert!(bad.is_empty(), "errors in the console: {bad:#?}");
+        let mut requests = 0;
         for entry in self.log("performance").await {
             let text = entry["message"].as_str().unwrap_or_default();
             let event: Value = serde_json::from_str(text).unwrap_or_default();
@@ -201,7 +202,7 @@ impl Browser {
                 _ => continue,
             };
             let url = url.as_str().unwrap_or_default();
-            // What the browser's own empty tab asks for is not the page's doing.
+            // Requests of the browser's empty tab are not the page's.
             if params["documentURL"]
                 .as_str()
                 .is_some_and(|page| page.starts_with("chrome"))
@@ -211,16 +212,16 @@ impl Browser {
             let local = ["data:", "blob:", "about:"]
                 .iter()
                 .any(|scheme| url.starts_with(scheme));
-            let to = url.replacen("ws://", "http://", 1);
+            let target = url.replacen("ws://", "http://", 1);
             assert!(
-                local || to.starts_with(origin),
-                "a request to {url}, off {origin}"
+                local || target.starts_with(origin),
+                "a request to {url}, which is not at {origin}"
             );
-            own += 1;
+            requests += 1;
         }
         assert!(
-            own > 5,
-            "only {own} requests were seen: the log is not what it should be"
+            requests > 5,
+            "only {requests} requests in the log, which must be incomplete"
         );
     }
 
@@ -230,13 +231,13 @@ impl Browser {
     }
 
     async fn log(&self, kind: &str) -> Vec<Value> {
-        let log = self.own("se/log", json!({"type": kind})).await;
+        let log = self.driver_command("se/log", json!({"type": kind})).await;
         log.as_array().cloned().expect("a list")
     }
 
-    /// A command that only this driver knows.
-    async fn own(&self, path: &'static str, body: Value) -> Value {
-        let command = Own { path, body };
+    /// Sends a command that is specific to chromedriver.
+    async fn driver_command(&self, path: &'static str, body: Value) -> Value {
+        let command = DriverCommand { path, body };
         self.client
             .issue_cmd(command)
             .await
@@ -246,7 +247,7 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        // The whole group: the driver, and a browser that it could not end because a test has failed.
+        // Ends the whole group, because a failed test leaves the browser open.
         let group = format!("-{}", self.driver.id());
         drop(Command::new("kill").args(["-KILL", "--", &group]).status());
         drop(self.driver.wait());
@@ -254,12 +255,12 @@ impl Drop for Browser {
 }
 
 #[derive(Debug)]
-struct Own {
+struct DriverCommand {
     path: &'static str,
     body: Value,
 }
 
-impl WebDriverCompatibleCommand for Own {
+impl WebDriverCompatibleCommand for DriverCommand {
     fn endpoint(&self, base: &url::Url, session: Option<&str>) -> Result<url::Url, url::ParseError> {
         base.join(&format!("session/{}/{}", session.unwrap_or_default(), self.path))
     }

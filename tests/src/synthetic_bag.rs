@@ -1,4 +1,4 @@
-//! A ROS 2 bag of a drive in a room that is drawn here.
+//! A ROS 2 bag of a drive through a small synthetic room.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::fs::File;
@@ -24,7 +24,7 @@ const BASE_LINK_FROM_LASER: Pose = Pose {
 };
 const BEAMS: u32 = 361;
 
-/// A room of 8 m x 4 m, with a recess that tells one end from the other.
+/// A room of 8 m x 4 m. A recess at one end makes it asymmetric.
 pub fn room() -> OccupancyGrid {
     let (width, height) = (160, 80);
     let wall = |column: usize, row: usize| {
@@ -41,7 +41,7 @@ pub fn room() -> OccupancyGrid {
     OccupancyGrid::new(width, height, RESOLUTION, Pose::IDENTITY, cells)
 }
 
-/// Where the car is at a time after the start \[s\]: on a circle in the room's left half.
+/// The car's pose at a time after the start \[s\]. It drives on a circle in the left half of the room.
 pub fn true_pose(seconds: f64) -> Pose {
     let angle = seconds * SPEED / RADIUS;
     Pose::new(
@@ -51,7 +51,8 @@ pub fn true_pose(seconds: f64) -> Pose {
     )
 }
 
-/// Writes a drive of so many seconds: 40 Hz scans, 50 Hz odometry, truth, and where the laser is.
+/// Writes a bag of the given duration \[s\], with scans at 40 Hz, odometry and ground truth at 50 Hz, and the laser's
+/// transform.
 pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
     let file = BufWriter::new(File::create(path).expect("a new file"));
     let mut bag = mcap::Writer::new(file).expect("a bag");
@@ -98,7 +99,7 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
         messages::encode(&TfMessage { transforms }).expect("encoded"),
     );
     let first = true_pose(0.0);
-    // Both in one loop of 5 ms, so that the bag is in order of time.
+    // One loop of 5 ms keeps the messages in order of time.
     for tick in 0..(seconds * 200.0) as u32 {
         let now = f64::from(tick) * 0.005;
         let pose = true_pose(now);
@@ -137,7 +138,7 @@ pub fn write_bag(path: &Path, room: &OccupancyGrid, seconds: f64) {
     bag.finish().expect("a whole file");
 }
 
-/// Range of a beam, by steps of 5 mm: nothing of the code under test \[m\].
+/// Range of a beam \[m\]. It is found in steps of 5 mm, without the code under test.
 fn range(room: &OccupancyGrid, laser: Pose, angle: f64) -> f32 {
     let (sin, cos) = (laser.heading + angle).sin_cos();
     let steps = (0..).map(|step| f64::from(step) * 0.005);

@@ -1,11 +1,11 @@
-//! The page as its users have it: in a browser, with cars that are processes of their own.
+//! Tests of the page in a browser, with cars that run as separate processes.
 //!
-//! Needs Chromium and its driver: `cargo test -p system-tests --features browser --test page`. Pictures go to the
-//! folder that `PITWALL_CI_OUTPUT` names, else to the system's folder for temporary files.
+//! Needs Chromium and its driver: `cargo test -p system-tests --features browser --test page`. Screenshots
+//! go to the folder that `PITWALL_CI_OUTPUT` names, else to the folder for temporary files.
 
 #![allow(
     clippy::too_many_lines,
-    reason = "a story is told from its beginning to its end"
+    reason = "a test follows one user's steps from start to end"
 )]
 
 use std::process::{Child, Command, Stdio};
@@ -16,20 +16,20 @@ use serde_json::Value;
 use system_tests::{Behaviour, Browser, FakeCar, free_endpoint, router, wait_until};
 use tokio::sync::{Mutex, MutexGuard};
 
-/// One browser at a time is enough for two cores.
-static TURN: LazyLock<Mutex<()>> = LazyLock::new(Mutex::default);
+/// Held by the test that runs, so that only one uses the processor.
+static ONE_AT_A_TIME: LazyLock<Mutex<()>> = LazyLock::new(Mutex::default);
 
-struct Stage {
+struct TestBench {
     server: PitWallServer,
     endpoint: String,
     recordings: tempfile::TempDir,
-    _turn: MutexGuard<'static, ()>,
+    _guard: MutexGuard<'static, ()>,
 }
 
-impl Stage {
-    /// A pit wall with its page, at ports that nobody else uses.
-    async fn set() -> Self {
-        let turn = TURN.lock().await;
+impl TestBench {
+    /// Starts a pit wall and its page on free ports.
+    async fn start() -> Self {
+        let guard = ONE_AT_A_TIME.lock().await;
         let endpoint = free_endpoint();
         let recordings = tempfile::tempdir().expect("a folder");
         let server = PitWallServer::start(PitWallOptions {
@@ -45,7 +45,7 @@ impl Stage {
             server,
             endpoint,
             recordings,
-            _turn: turn,
+            _guard: guard,
         }
     }
 
@@ -54,7 +54,7 @@ impl Stage {
     }
 }
 
-/// A process that a test ends by force.
+/// A car in a process of its own. Dropping it kills the process.
 struct CarProcess(Child);
 
 impl CarProcess {
@@ -66,7 +66,7 @@ impl CarProcess {
         Self(child.expect("a car"))
     }
 
-    /// Ends it as a power cut does.
+    /// Kills the process, as a power cut would.
     fn kill(&mut self) {
         self.0.kill().expect("killed");
     }
@@ -83,7 +83,7 @@ fn card(car: &str) -> String {
     format!("document.querySelector('.card[data-car=\"{car}\"]')")
 }
 
-fn said(text: &str) -> String {
+fn logged(text: &str) -> String {
     format!("[...document.querySelectorAll('#log li')].some((line) => line.textContent.includes('{text}'))")
 }
 
@@ -91,8 +91,8 @@ fn number(value: &Value) -> f64 {
     value.as_f64().expect("a number")
 }
 
-/// Does something to a car until the car says that it is done, and returns what it says. Where the machine has much else
-/// to do, an answer may not come in time: the page says so, and giving the command again is harmless.
+/// Repeats an action on a car until the car accepts it, and returns the text on its card. On a busy machine an answer may
+/// come too late; the page then shows NO ANSWER, and repeating the command is harmless.
 async fn until_done(browser: &Browser, car: &str, act: impl AsyncFn()) -> String {
     let answer = format!(
         "(() => {{ const note = {}.querySelector('.note p'); return /done|failed/.test(note.className) && [note.className, note.textContent]; }})()",
@@ -100,24 +100,24 @@ async fn until_done(browser: &Browser, car: &str, act: impl AsyncFn()) -> String
     );
     for _ in 0..10 {
         act().await;
-        let said = browser.wait("the car answers, or does not", &answer).await;
-        let [kind, text] = [0, 1].map(|i| said[i].as_str().unwrap_or_default().to_owned());
+        let note = browser.wait("an answer or a failure on the card", &answer).await;
+        let [kind, text] = [0, 1].map(|i| note[i].as_str().unwrap_or_default().to_owned());
         if kind == "done" {
             return text;
         }
         assert!(text.contains("NO ANSWER"), "{text}");
     }
-    panic!("{car} never answers in time");
+    panic!("no answer of {car} came in time");
 }
 
-/// A race engineer's session, from the first car to a lost one.
+/// A race engineer watches three cars, switches a set, sets a pose, and sees one car fall silent.
 #[tokio::test(flavor = "multi_thread")]
-async fn three_cars_are_seen_switched_placed_and_lost() {
-    let stage = Stage::set().await;
+async fn three_cars_are_shown_switched_relocated_and_lost() {
+    let bench = TestBench::start().await;
     let mut cars: Vec<CarProcess> = [("car-1", -4.0), ("car-2", -12.0), ("car-3", -20.0)]
-        .map(|(name, start)| CarProcess::race(name, start, &stage.endpoint))
+        .map(|(name, start)| CarProcess::race(name, start, &bench.endpoint))
         .into();
-    let ana = stage.browser().await;
+    let ana = bench.browser().await;
     for car in ["car-1", "car-2", "car-3"] {
         let localized = format!("{}?.innerText.includes('LOCALIZED')", card(car));
         ana.wait("the car appears and is localized", &localized).await;
@@ -129,9 +129,11 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
     .await;
     ana.fill("#operator", "ana").await;
 
-    // Two sizes and both themes, to be looked at.
-    ana.ask("document.documentElement.dataset.theme === 'dark' || document.getElementById('theme').click()")
-        .await;
+    // Screenshots of two sizes in both themes.
+    ana.evaluate(
+        "document.documentElement.dataset.theme === 'dark' || document.getElementById('theme').click()",
+    )
+    .await;
     for theme in ["dark", "light"] {
         ana.wait(
             "the theme",
@@ -148,17 +150,17 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
             let overflow = "document.documentElement.scrollWidth > innerWidth || \
                             [...document.querySelectorAll('.card')].some((card) => card.scrollWidth > card.clientWidth + 1)";
             assert_eq!(
-                ana.ask(overflow).await,
+                ana.evaluate(overflow).await,
                 false,
-                "something is wider than its place at {width}x{height}"
+                "an element overflows at {width}x{height}"
             );
-            ana.picture(&format!("page-{theme}-{width}x{height}")).await;
+            ana.screenshot(&format!("page-{theme}-{width}x{height}")).await;
         }
         ana.key("t").await;
     }
     ana.resize(1366, 768).await;
 
-    let ben = stage.browser().await;
+    let ben = bench.browser().await;
     ben.wait(
         "the other browser has the cars",
         "document.querySelectorAll('.card').length === 3",
@@ -166,12 +168,12 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
     .await;
     ben.fill("#operator", "ben").await;
     ana.wait(
-        "who else looks is visible",
+        "the other operator is shown",
         "document.getElementById('people').textContent.includes('ben')",
     )
     .await;
 
-    // A switch, clicked and confirmed, and seen by the other.
+    // A switch by one operator is confirmed and seen by both.
     let switch = async || ana.click(".card[data-car=\"car-2\"] button[data-set=lq]").await;
     let answer = until_done(&ana, "car-2", switch).await;
     assert!(answer.contains("lq (revision"), "{answer}");
@@ -183,14 +185,14 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
         browser.wait("lq is in force", &pressed).await;
         browser
             .wait(
-                "the log tells who",
-                &said("car-2 set lq (revision 2) replaces hq"),
+                "the switch is in the log",
+                &logged("car-2 set lq (revision 2) replaces hq"),
             )
             .await;
-        browser.wait("by name", &said("[ana]")).await;
+        browser.wait("the operator is in the log", &logged("[ana]")).await;
     }
 
-    // A pose, dragged on the other browser.
+    // The other operator drags a pose.
     ben.click(".card[data-car=\"car-3\"]").await;
     ben.wait("car-3 is selected", "pitwall.selected === 'car-3'")
         .await;
@@ -200,32 +202,32 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
             "((box) => {{ const [x, y] = pitwall.toCanvas({x}, {y}); return [box.left + x, box.top + y]; }})({canvas})"
         )
     };
-    // Where the car is now, towards where it heads: a pose that an engineer could give.
+    // The drag starts at the car and goes along its heading.
     let pressed = std::cell::Cell::new((0.0, 0.0));
-    let place = async || {
+    let drag_pose = async || {
         ben.click("#place").await;
         let pose = ben
-            .ask("((p) => [p.x_m, p.y_m, p.heading_rad])(pitwall.snapshot.cars.find((c) => c.car === 'car-3').pose)")
+            .evaluate("((p) => [p.x_m, p.y_m, p.heading_rad])(pitwall.snapshot.cars.find((c) => c.car === 'car-3').pose)")
             .await;
         let [x, y, heading] = [0, 1, 2].map(|i| number(&pose[i]));
         let [from, to] = [
-            ben.ask(&at(x, y)).await,
-            ben.ask(&at(x + 3.0 * heading.cos(), y + 3.0 * heading.sin()))
+            ben.evaluate(&at(x, y)).await,
+            ben.evaluate(&at(x + 3.0 * heading.cos(), y + 3.0 * heading.sin()))
                 .await,
         ]
         .map(|point| [number(&point[0]), number(&point[1])]);
         pressed.set((x, y));
         ben.drag(from, to).await;
     };
-    until_done(&ben, "car-3", place).await;
+    until_done(&ben, "car-3", drag_pose).await;
     let (x, y) = pressed.get();
     for browser in [&ana, &ben] {
         browser
-            .wait("the log has the pose", &said("car-3 initial pose ("))
+            .wait("the log has the pose", &logged("car-3 initial pose ("))
             .await;
     }
     let given = ben
-        .ask("[...document.querySelectorAll('#log li')].find((line) => line.textContent.includes('car-3 initial pose (') && line.textContent.includes('[ben]')).textContent.match(/-?\\d+\\.\\d+/g).map(Number)")
+        .evaluate("[...document.querySelectorAll('#log li')].find((line) => line.textContent.includes('car-3 initial pose (') && line.textContent.includes('[ben]')).textContent.match(/-?\\d+\\.\\d+/g).map(Number)")
         .await;
     let off = (number(&given[0]) - x).hypot(number(&given[1]) - y);
     assert!(
@@ -233,10 +235,10 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
         "pressed at ({x:.2}, {y:.2}), taken as {given}: {off:.2} m off"
     );
 
-    // A car is killed: its card turns grey on both. The page itself watches for that.
+    // A car is killed. Its card turns grey on both pages.
     for browser in [&ana, &ben] {
         browser
-            .ask(&format!(
+            .evaluate(&format!(
                 "new MutationObserver(() => {{ if (!window.greyed && {card}.classList.contains('blind')) window.greyed = Date.now(); }})\
                  .observe({card}, {{attributes: true}})",
                 card = card("car-1")
@@ -248,7 +250,7 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
         browser.wait("the card is grey", "window.greyed").await;
         browser
             .wait(
-                "it says for how long",
+                "the card shows for how long",
                 &format!("{}.innerText.match(/silent for \\d/)", card("car-1")),
             )
             .await;
@@ -256,29 +258,29 @@ async fn three_cars_are_seen_switched_placed_and_lost() {
             .wait("there is an alarm", "!document.getElementById('alarm').hidden")
             .await;
     }
-    ana.picture("page-car-1-blind").await;
+    ana.screenshot("page-car-1-blind").await;
 
-    // Seen by one, and so by all.
+    // One operator acknowledges the alarm for all.
     ana.click("#alarm").await;
     for browser in [&ana, &ben] {
         browser
             .wait("no alarm is open", "document.getElementById('alarm').hidden")
             .await;
     }
-    let origin = stage.server.url().to_owned();
+    let origin = bench.server.url().to_owned();
     for browser in [ana, ben] {
         browser.expect_clean(&origin).await;
         browser.close().await;
     }
-    stage.server.stop().await;
+    bench.server.stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn refusals_silence_candidates_and_markers_are_shown() {
-    let stage = Stage::set().await;
-    let car = FakeCar::start("car-1", &stage.endpoint, Behaviour::default()).await;
-    let silent = FakeCar::start_mute(&stage.endpoint).await;
-    let browser = stage.browser().await;
+async fn refusals_timeouts_candidates_and_markers_are_shown() {
+    let bench = TestBench::start().await;
+    let car = FakeCar::start("car-1", &bench.endpoint, Behaviour::default()).await;
+    let silent = FakeCar::start_mute(&bench.endpoint).await;
+    let browser = bench.browser().await;
     browser
         .wait(
             "both cars",
@@ -287,10 +289,10 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .await;
     browser.fill("#operator", "ana").await;
 
-    // No answer reads differently from a refusal.
+    // A timeout is shown differently from a refusal.
     browser.click(".card[data-car=mute] button[data-set=lq]").await;
     let failed = |name: &str| format!("{}.querySelector('.note p.failed')?.textContent", card(name));
-    let text = browser.wait("the silence is told", &failed("mute")).await;
+    let text = browser.wait("the timeout is shown", &failed("mute")).await;
     assert!(
         text.as_str().is_some_and(|text| text.contains("NO ANSWER")),
         "{text}"
@@ -300,13 +302,13 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .wait("car-1 is selected", "pitwall.selected === 'car-1'")
         .await;
     browser.key("c").await;
-    let text = browser.wait("the refusal is told", &failed("car-1")).await;
+    let text = browser.wait("the refusal is shown", &failed("car-1")).await;
     assert!(
         text.as_str().is_some_and(|text| text.contains("REFUSED")),
         "{text}"
     );
 
-    // A search answers with places to pick from.
+    // Relocalization returns candidates to choose from.
     browser.key("g").await;
     browser
         .wait(
@@ -316,24 +318,24 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .await;
     browser.click("#candidates button:nth-child(2)").await;
     let done = format!("{}.querySelector('.note p.done')", card("car-1"));
-    browser.wait("the pick is taken", &done).await;
+    browser.wait("the choice is accepted", &done).await;
     browser
         .wait(
-            "nothing is left to pick",
+            "no candidates are left",
             "document.getElementById('candidates').hidden",
         )
         .await;
 
-    // Laps have sectors that add up.
+    // A lap's sectors add up to its time.
     browser.click("#tab-laps").await;
     let sectors = "(() => { const row = [...document.querySelectorAll('#laps tr')].map((r) => [...r.cells].map((c) => c.textContent)) \
                    .find((r) => r[5]?.match(/^\\d/) && r[3].match(/^\\d/)); return row && row.slice(1, 6).map(Number); })()";
     let lap = browser.wait("a lap with all sectors", sectors).await;
     let [time, one, two, three] = [0, 2, 3, 4].map(|i| number(&lap[i]));
-    // Fake cars tell 2 s for a lap whatever it took; each sector is rounded to a hundredth.
+    // Fake cars report 2 s for every lap. Each sector is rounded to a hundredth.
     assert!((one + two + three - time).abs() < 0.5, "{lap}");
 
-    // What the engineer types goes into the recording.
+    // A marker goes into the recording.
     browser.key("r").await;
     browser
         .wait(
@@ -347,7 +349,7 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .await;
     browser.fill("#marker-text", "rain at turn two").await;
     browser
-        .wait("the marker is in the log", &said("rain at turn two [ana]"))
+        .wait("the marker is in the log", &logged("rain at turn two [ana]"))
         .await;
     browser.key("r").await;
     browser
@@ -356,7 +358,7 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
             "document.getElementById('recording').textContent.includes('saved')",
         )
         .await;
-    let file = std::fs::read_dir(stage.recordings.path())
+    let file = std::fs::read_dir(bench.recordings.path())
         .expect("a folder")
         .next()
         .expect("a recording")
@@ -371,7 +373,7 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
         .collect();
     assert_eq!(markers, ["ana: rain at turn two"]);
 
-    // The large view, the help, and every tab open without a fault.
+    // The large view, the help and every tab open without an error.
     for key in ["o", "p", "u", "Escape", "f", "0", "e", "ArrowDown", "ArrowUp"] {
         browser.key(key).await;
     }
@@ -382,24 +384,24 @@ async fn refusals_silence_candidates_and_markers_are_shown() {
             "document.querySelector('#large .headline')?.innerText.includes('LOCALIZED')",
         )
         .await;
-    browser.picture("page-large").await;
+    browser.screenshot("page-large").await;
     browser.key("Escape").await;
-    browser.expect_clean(stage.server.url()).await;
+    browser.expect_clean(bench.server.url()).await;
 
-    // The program ends: everything on the page is old, and says so.
-    let Stage { server, .. } = stage;
+    // After the pit wall has stopped, the page is grey and shows the age of its data.
+    let TestBench { server, .. } = bench;
     server.stop().await;
     browser
         .wait("the page is grey", "document.body.classList.contains('cut') && document.getElementById('link').textContent.includes('no news for')")
         .await;
-    browser.picture("page-cut").await;
+    browser.screenshot("page-cut").await;
     browser.close().await;
     drop((car, silent));
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recording_is_replayed_on_the_same_page() {
-    let turn = TURN.lock().await;
+    let guard = ONE_AT_A_TIME.lock().await;
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("session.mcap");
     let endpoint = free_endpoint();
@@ -424,10 +426,10 @@ async fn a_recording_is_replayed_on_the_same_page() {
     service.close().await;
 
     let replay = pitwall::Replay::start(&file).expect("a good file");
-    // It waits at its begin until the page is there.
+    // The replay is paused before the page opens.
     replay
         .steer(Some(false), Some(2.0), Some(0.5))
-        .expect("a good wish");
+        .expect("valid settings");
     let options = PageOptions {
         address: ([127, 0, 0, 1], 0).into(),
         ..PageOptions::default()
@@ -440,7 +442,7 @@ async fn a_recording_is_replayed_on_the_same_page() {
     browser.wait("the car drives again", &localized).await;
     browser
         .wait(
-            "it is paused where it was put",
+            "it is paused at the time given",
             "Math.abs(pitwall.snapshot.replay.at_s - 0.5) < 0.01",
         )
         .await;
@@ -453,8 +455,8 @@ async fn a_recording_is_replayed_on_the_same_page() {
         .await;
     let laps = replay.board().fleet().cars().next().map(|car| car.laps().len());
     assert!(laps.is_some_and(|laps| laps >= 2), "{laps:?}");
-    browser.picture("page-replay").await;
-    let epoch = number(&browser.ask("pitwall.snapshot.epoch").await);
+    browser.screenshot("page-replay").await;
+    let epoch = number(&browser.evaluate("pitwall.snapshot.epoch").await);
     browser.key(",").await;
     browser
         .wait("it has jumped back", &format!("pitwall.snapshot.epoch > {epoch}"))
@@ -463,5 +465,5 @@ async fn a_recording_is_replayed_on_the_same_page() {
     browser.close().await;
     page.stop().await;
     replay.stop();
-    drop(turn);
+    drop(guard);
 }

@@ -74,7 +74,7 @@ async fn measure(options: &Options) -> anyhow::Result<()> {
         .with_context(|| format!("test-car, beside {}", me.display()))?;
     let cars = Running(cars);
     wait_for(&page)?;
-    let browser = Browser::open_unwatched(&format!("http://{page}/"), 1366, 768).await;
+    let browser = Browser::open_without_logs(&format!("http://{page}/"), 1366, 768).await;
     let all = format!(
         "document.querySelectorAll('.card.good').length === {}",
         options.cars
@@ -87,10 +87,10 @@ async fn measure(options: &Options) -> anyhow::Result<()> {
             .await;
     }
 
-    // Counts what is drawn from here on. Callbacks asked for during a frame run in the next one: two in one frame
-    // are one picture.
+    // Counts the snapshots drawn from here on. A callback requested during a frame runs in the next one, so
+    // two snapshots within one frame count once.
     browser
-        .ask("(() => { pitwall.ages.length = 0; window.drawn = 0; let seen = null; const count = () => { \
+        .evaluate("(() => { pitwall.ages.length = 0; window.drawn = 0; let seen = null; const count = () => { \
               if (pitwall.snapshot !== seen) { seen = pitwall.snapshot; window.drawn += 1; } requestAnimationFrame(count); }; \
               requestAnimationFrame(count); return 1; })()")
         .await;
@@ -98,8 +98,8 @@ async fn measure(options: &Options) -> anyhow::Result<()> {
     let mut ages: Vec<f64> = Vec::new();
     while begun.elapsed() < Duration::from_secs(options.seconds) {
         tokio::time::sleep(Duration::from_secs(5)).await;
-        // The page keeps the last thousand: fetched before they are pushed out.
-        let taken = browser.ask("pitwall.ages.splice(0)").await;
+        // The page keeps the last thousand ages. They are fetched before they are overwritten.
+        let taken = browser.evaluate("pitwall.ages.splice(0)").await;
         ages.extend(
             taken
                 .as_array()
@@ -110,16 +110,20 @@ async fn measure(options: &Options) -> anyhow::Result<()> {
     }
     let seconds = begun.elapsed().as_secs_f64();
     let cores = (cpu_seconds(wall.0.id())? - busy) / seconds;
-    let drawn = browser.ask("window.drawn").await.as_f64().context("a count")?;
+    let drawn = browser
+        .evaluate("window.drawn")
+        .await
+        .as_f64()
+        .context("a count")?;
     let poses = browser
-        .ask("pitwall.snapshot.cars.reduce((sum, car) => sum + car.streams.pose.rate_hz, 0)")
+        .evaluate("pitwall.snapshot.cars.reduce((sum, car) => sum + car.streams.pose.rate_hz, 0)")
         .await;
     let missing = browser
-        .ask("pitwall.snapshot.cars.reduce((sum, car) => sum + Object.values(car.streams).reduce((n, s) => n + s.missing, 0), 0)")
+        .evaluate("pitwall.snapshot.cars.reduce((sum, car) => sum + Object.values(car.streams).reduce((n, s) => n + s.missing, 0), 0)")
         .await;
     let memory = status(wall.0.id(), "VmRSS:")? / 1e3;
     let peak = status(wall.0.id(), "VmHWM:")? / 1e3;
-    browser.picture("page-load").await;
+    browser.screenshot("page-load").await;
     browser.close().await;
     drop((cars, wall));
 

@@ -1,4 +1,4 @@
-//! A headless Chromium, controlled through WebDriver.
+//! A headless Chromium, controlled through `WebDriver`.
 
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;

@@ -453,7 +453,7 @@ async fn a_recording_is_replayed_on_the_same_page() {
             "pitwall.snapshot.replay.at_s === pitwall.snapshot.replay.duration_s",
         )
         .await;
-    let laps = replay.board().fleet().cars().next().map(|car| car.laps().len());
+    let laps = replay.bus().fleet().cars().next().map(|car| car.laps().len());
     assert!(laps.is_some_and(|laps| laps >= 2), "{laps:?}");
     browser.screenshot("page-replay").await;
     let epoch = number(&browser.evaluate("pitwall.snapshot.epoch").await);

@@ -38,7 +38,7 @@ pub(crate) struct Car {
     pub(crate) recovery_ready: Option<Duration>,
     spun: bool,
     pub(crate) wall_contact: ContactTimer,
-    pub(crate) car_contact: ContactTimer,
+    pub(crate) opponent_contact: ContactTimer,
 }
 
 impl Car {
@@ -68,7 +68,7 @@ impl Car {
             recovery_ready: None,
             spun: false,
             wall_contact: ContactTimer::default(),
-            car_contact: ContactTimer::default(),
+            opponent_contact: ContactTimer::default(),
         }
     }
 

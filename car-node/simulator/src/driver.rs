@@ -19,7 +19,7 @@ impl Driver {
     /// A driver whose model of the car is `vehicle`.
     pub fn new(params: DriverParams, vehicle: VehicleParams) -> Self {
         Self {
-            pursuit: Pursuit::new(params, vehicle),
+            pursuit: Pursuit::new(&params, &vehicle),
             manoeuvre: ManoeuvrePlanner::new(),
         }
     }

@@ -40,10 +40,10 @@ const SPEED_OF_TRAFFIC: f64 = 2.0;
 
 impl Pursuit {
     /// The driver's model of the car is `vehicle`. No trim is learnt yet.
-    pub(crate) fn new(params: DriverParams, vehicle: VehicleParams) -> Self {
+    pub(crate) fn new(params: &DriverParams, vehicle: &VehicleParams) -> Self {
         Self {
-            params,
-            vehicle,
+            params: *params,
+            vehicle: *vehicle,
             trim: 0.0,
         }
     }

@@ -198,7 +198,7 @@ impl World {
                             away.map(|v| v * side * 0.6 * impact),
                         );
                     }
-                    if car.car_contact.begins(now) {
+                    if car.opponent_contact.begins(now) {
                         let contact = Contact {
                             pose: car.vehicle.pose(),
                             impact,

@@ -216,23 +216,13 @@ fn localizes(naming: Naming) {
         map: Arc::new(TrackMap::new(track.grid.clone()).expect("free")),
         raceline: None,
     };
-    let (pose_sink, poses) = match source.ros_connection() {
-        None => (None, None),
-        Some(side) => {
-            let poses = ros_router
-                .declare_subscriber("0/pf/pose/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0123")
-                .wait()
-                .expect("subscribes");
-            (
-                Some(
-                    pose_publisher::start(side.clone(), pose_publisher::TOPIC)
-                        .expect("starts")
-                        .0,
-                ),
-                Some(poses),
-            )
-        }
-    };
+    let (mut pose_sink, mut poses) = (None, None);
+    if let Some(connection) = source.ros_connection() {
+        let key = "0/pf/pose/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0123";
+        poses = Some(ros_router.declare_subscriber(key).wait().expect("subscribes"));
+        let started = pose_publisher::start(connection.clone(), pose_publisher::TOPIC);
+        pose_sink = Some(started.expect("starts").0);
+    }
     assert_eq!(pose_sink.is_some(), naming == Naming::RmwZenoh);
     let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
     config.start = Start::Pose(start);

@@ -50,7 +50,7 @@ const UNDER_EACH: f64 = 1.5;
 const NEAR: f64 = 0.5;
 
 /// The filter answers within this, or hangs.
-const DEADLINE: Duration = Duration::from_secs(60);
+const DEADLINE: Duration = Duration::from_mins(1);
 
 /// A filter and what commands it, without a network.
 struct Car {

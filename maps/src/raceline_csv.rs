@@ -55,20 +55,19 @@ pub(crate) fn rows(file: &str, text: &str) -> Result<Vec<Row>, MapError> {
     let Some(first) = data.first() else {
         return Ok(Vec::new());
     };
-    let columns = match columns {
-        Some(columns) => columns,
-        None => {
-            // A comment with a name for each column is a header, too. Words with spaces between them are prose.
-            if let Some(header) = comment.filter(|line| {
-                line.number < first.number
-                    && line.is_header()
-                    && line.separator.is_some()
-                    && line.fields.len() == first.fields.len()
-            }) {
-                return Err(unknown_header(file, &header));
-            }
-            guess(file, &data)?
+    let columns = if let Some(columns) = columns {
+        columns
+    } else {
+        // A comment with a name for each column is a header, too. Words with spaces between them are prose.
+        if let Some(header) = comment.filter(|line| {
+            line.number < first.number
+                && line.is_header()
+                && line.separator.is_some()
+                && line.fields.len() == first.fields.len()
+        }) {
+            return Err(unknown_header(file, &header));
         }
+        guess(file, &data)?
     };
     data.iter().map(|line| columns.row(file, line)).collect()
 }

@@ -76,7 +76,7 @@ impl LocalizerParameters {
         let mut table = parameter_table(text)?;
         let kind = table.remove(KIND_KEY);
         match kind_of(kind.as_ref()).map_err(|fault| vec![fault])? {
-            SYNPF => Parameters::from_table(table).map(|(set, unknown)| (set.into(), unknown)),
+            SYNPF => Parameters::from_table(&table).map(|(set, unknown)| (set.into(), unknown)),
             _ => ReferenceParameters::from_table(table).map(|(set, unknown)| (set.into(), unknown)),
         }
     }

@@ -84,7 +84,7 @@ mod tests {
             .expect("on the map");
         assert_eq!((map.pending_tables().len(), map.table_bytes()), (1, 0));
         worker.build_pending();
-        let deadline = Instant::now() + Duration::from_secs(60);
+        let deadline = Instant::now() + Duration::from_mins(1);
         while map.table_bytes() == 0 {
             assert!(Instant::now() < deadline, "no table within a minute");
             thread::yield_now();

@@ -270,7 +270,7 @@ impl CarRunner {
                         monitor.on_new_pose(stamp(world.now()));
                     }
                     ActivePoseSource::Odometry(map_from_odom, start) => {
-                        (*map_from_odom, *start) = (None, *pose)
+                        (*map_from_odom, *start) = (None, *pose);
                     }
                     ActivePoseSource::Truth => {}
                 }

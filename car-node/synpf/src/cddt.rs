@@ -16,10 +16,10 @@ pub(crate) const DIRECTIONS: usize = 256;
 /// Directions over half a turn.
 pub(crate) const HALF_TURN: usize = DIRECTIONS / 2;
 
-/// CddtSlice per cell.
+/// Lanes per cell.
 const FINE: f32 = 2.0;
 
-/// CddtSlice for every direction over half a turn.
+/// A [`CddtSlice`] for each direction over half a turn.
 #[derive(Debug)]
 pub(crate) struct Cddt {
     directions: Vec<CddtSlice>,
@@ -94,7 +94,7 @@ struct Crossing {
     slope: f32,
 }
 
-/// CrossingBlock crossings, compared at once.
+/// Four crossings, compared at once.
 #[derive(Debug, Clone, Copy)]
 struct CrossingBlock {
     at: [f32; 4],

@@ -70,13 +70,13 @@ impl Parameters {
 
     /// Reads a flat YAML file; see [`parameter_table`] and [`Self::from_table`].
     pub fn from_yaml(text: &str) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
-        Self::from_table(parameter_table(text)?)
+        Self::from_table(&parameter_table(text)?)
     }
 
     /// A set from a table of our own keys, or of those of the reference's `pf2_params.yaml`. Keys not given keep the value
     /// they have in `hq`; a table that gives only `max_particles` lowers `min_particles` with it. Returns the set and the
     /// keys that are unknown, for a warning. Faults are listed whole.
-    pub fn from_table(given: ParameterValues) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
+    pub fn from_table(given: &ParameterValues) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
         let mut base = Self::default();
         if let Some(most) = given.get("max_particles").and_then(Value::as_u64)
             && !given.contains_key("min_particles")

@@ -60,10 +60,10 @@ mod tests {
     impl Room {
         fn random(random: &mut SmallRng) -> Self {
             let mut cells = vec![Cell::Free; SIDE * SIDE];
-            for i in 0..SIDE * SIDE {
+            for (i, cell) in cells.iter_mut().enumerate() {
                 let (column, row) = (i % SIDE, i / SIDE);
                 if [column, row].into_iter().any(|v| !(3..SIDE - 3).contains(&v)) {
-                    cells[i] = Cell::Occupied;
+                    *cell = Cell::Occupied;
                 }
             }
             for k in 0..16 {

@@ -146,7 +146,7 @@ fn what_is_handed_over_is_as_it_was_received() {
     let old: Scan = scan(&map, 1.9);
     assert_eq!(next.on_scan(&old).err(), Some(Dropped::TimeBackwards));
     drive(&mut next, &map, 2.0..2.1, |update| {
-        assert!(update.number > last.number)
+        assert!(update.number > last.number);
     });
 }
 

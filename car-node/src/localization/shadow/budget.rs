@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use synpf::Stamp;
 
-/// ScanOutcome over this long [s].
+/// Outcomes of scans are counted over this long [s].
 const WINDOW: f64 = 2.0;
 /// Messages waiting for the filter at a scan, beyond which it is behind: about 0.1 s of a car's sensors.
 const BEHIND: usize = 10;

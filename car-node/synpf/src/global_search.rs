@@ -336,6 +336,10 @@ impl Search {
         } else {
             3.0 * parameters.search_margin
         };
+        // Not before the rest of the map was looked at.
+        if self.since_check.is_infinite() {
+            return None;
+        }
         let (scans, seconds) = CONFIRMED_AFTER;
         let followed = best.scans >= scans && best.seconds >= seconds;
         let fits = best.fit() >= self.least_fit * (-self.seconds / LEAST_FIT_FOR).exp();

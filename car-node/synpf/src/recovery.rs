@@ -218,6 +218,9 @@ const PATIENCE: [f64; 2] = [0.1, 4.0];
 /// A rival that leads by so many pieces of wall explains the scans as well.
 const LEADING: f64 = 3.0;
 
+/// A correction larger than this is another place [m].
+const LEAP: f64 = 0.5;
+
 /// Share of the usual fit that another place must have.
 const AS_USUAL: f64 = 0.75;
 
@@ -428,6 +431,16 @@ impl Recovery {
         }
         if self.followed <= SETTLING {
             return Decision::Keep;
+        }
+        let leapt = evidence
+            .correction
+            .is_some_and(|correction| correction.x.hypot(correction.y) > LEAP);
+        if leapt && self.loss.broken(&self.parameters) {
+            // The particles have found the place that the car was carried to, perhaps. Motion has to confirm it.
+            let found = Candidate::new(map, scan, *estimate);
+            let mut search = Search::with(vec![found], 0.0, self.least_fit(), &self.settings);
+            search.check_soon();
+            return self.give_up(search);
         }
         let incumbent = Incumbent {
             map,

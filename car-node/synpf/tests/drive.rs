@@ -8,8 +8,8 @@ use common::{BASE_LINK_FROM_LASER, new_ring, odometry, ring, scan, truth};
 use maps::{Pose, wrap_angle};
 use proptest::prelude::*;
 use synpf::{
-    Dropped, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModelKind, Stamp, SynPf, TablePolicy,
-    TrackMap, Twist, Update, YawRate,
+    Dropped, Localizer, Mode, Odometry, Parameters, RangeMethod, Scan, SensorModelKind, Stamp, SynPf,
+    TablePolicy, TrackMap, Twist, Update, YawRate,
 };
 
 fn localizer(map: &Arc<TrackMap>, parameters: Parameters, seed: u64) -> SynPf {
@@ -187,6 +187,71 @@ fn a_kidnapped_car_says_so_and_recovers() {
         last.mode == Mode::Tracking && error(last) < 0.05,
         "{}",
         error(last)
+    );
+}
+
+/// Drives on from a second, a third of the track farther on than odometry says. Looks at the map take so many scans on another
+/// thread; with none they are left to the localizer.
+fn carried(rate: f64, delay: Option<usize>) -> Vec<(f64, Update, f64)> {
+    let map = ring();
+    let mut localizer = driven(&map, 4);
+    let missing = common::lap() / 3.0;
+    let (mut odom, mut jobs, mut updates) = (1.02, Vec::new(), Vec::new());
+    for k in 1..(2.0 * rate) as usize {
+        let at = 1.0 + k as f64 / rate;
+        while odom <= at {
+            // Odometry goes on from where it was: it has not noticed.
+            let mut message = odometry(odom + missing, 1.0);
+            message.stamp = message.stamp.plus(-missing);
+            let (before, after) = (truth(1.0), truth(1.0 + missing));
+            message.pose = before * message.pose.since(after);
+            localizer.on_odometry(&message).expect("sound");
+            odom += 0.02;
+        }
+        let mut scan = scan(&map, at + missing);
+        scan.stamp = scan.stamp.plus(-missing);
+        if let Some(delay) = delay {
+            jobs.extend(localizer.take_job().map(|job| (k + delay, job)));
+            if let Some(done) = jobs.iter().position(|(due, _)| *due <= k) {
+                let outcome = jobs.remove(done).1();
+                localizer.finish_job(outcome);
+            }
+        }
+        let update = localizer.on_scan(&scan).expect("an update");
+        let off = update.pose.distance(truth(at + missing));
+        updates.push((at - 1.0, update, off));
+    }
+    updates
+}
+
+#[test]
+fn a_carried_car_is_in_doubt_and_found_soon_at_every_scan_rate() {
+    for rate in [10.0, 20.0, 40.0] {
+        let updates = carried(rate, None);
+        let doubted = updates.iter().find(|(_, update, _)| update.doubt.is_some());
+        assert!(doubted.is_some_and(|(time, ..)| *time <= 0.3), "{rate} Hz");
+        let lost = updates
+            .iter()
+            .find(|(_, update, _)| update.mode == Mode::Searching);
+        // All of a ring looks alike to a laser that sees 2 m of it, so that a scan hardly breaks with the one before.
+        assert!(lost.is_some_and(|(time, ..)| *time <= 1.6), "{rate} Hz");
+        let (_, last, off) = updates.last().expect("updates");
+        assert!(last.mode == Mode::Tracking && *off < 0.05, "{rate} Hz: {off}");
+    }
+}
+
+#[test]
+fn a_look_at_the_map_on_another_thread_may_take_its_time() {
+    let here = carried(40.0, None);
+    for delay in [1, 4] {
+        let there = carried(40.0, Some(delay));
+        let (_, last, off) = there.last().expect("updates");
+        assert!(last.mode == Mode::Tracking && *off < 0.05, "{delay} scans: {off}");
+    }
+    assert_eq!(
+        format!("{here:?}"),
+        format!("{:?}", carried(40.0, None)),
+        "the same drive"
     );
 }
 

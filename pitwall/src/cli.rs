@@ -54,7 +54,8 @@ const GLOBAL: &str = "Global options";
 const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \
 none does, this program listens for the cars itself, on tcp/0.0.0.0:7447, while it runs.
 
-Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict.";
+Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict,
+7 recovered with losses.";
 
 #[derive(Debug, Args)]
 pub(crate) struct NetworkOptions {
@@ -178,7 +179,7 @@ pub(crate) enum Verb {
         #[arg(short, long, value_name = "FOLDER")]
         output: Option<PathBuf>,
     },
-    /// Repair a recording that was cut off.
+    /// Repair a recording that was cut off or damaged; exit code 7 when something was lost.
     Recover {
         /// The damaged file; it stays as it is.
         file: PathBuf,

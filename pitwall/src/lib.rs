@@ -46,8 +46,8 @@ pub use network::{
 };
 pub use program::program;
 pub use recording::{
-    Recorder, RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered,
-    StreamSummary, Unreadable, UnreadableCount, read_events, recover,
+    Damage, Recorder, RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary,
+    Recovered, StreamSummary, Unreadable, UnreadableCount, read_events, recover,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -5,11 +5,14 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
-use pitwall::{FleetService, RecordingError, RecordingSummary};
+use pitwall::{FleetService, RecordingError, RecordingSummary, Recovered};
 
 use super::{FIND, NO_SUCH_CAR, open, time_or_interrupt};
 use crate::cli::NetworkOptions;
 use crate::output;
+
+/// Exit code: something in the file could not be saved.
+const DATA_LOST: u8 = 7;
 
 /// A recording that takes longer to end says why.
 const UNREMARKED: Duration = Duration::from_millis(600);
@@ -67,13 +70,36 @@ pub(super) fn recover(file: &Path, output: Option<PathBuf>, json: bool) -> anyho
     if json {
         output::print_json(&recovered)?;
     } else {
-        let damage = recovered.damage.as_deref().unwrap_or("the file was whole");
-        output::print(&format!(
-            "{}: {} messages over {:.1} s saved ({damage})",
-            to.display(),
-            recovered.messages,
-            recovered.duration_s
-        ));
+        output::print(&describe(&recovered, &to));
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(if recovered.has_losses() {
+        ExitCode::from(DATA_LOST)
+    } else {
+        ExitCode::SUCCESS
+    })
+}
+
+fn describe(recovered: &Recovered, to: &Path) -> String {
+    let Recovered {
+        messages,
+        attachments,
+        metadata,
+        duration_s,
+        ..
+    } = recovered;
+    let mut lines = vec![format!(
+        "{}: saved {messages} messages over {duration_s:.1} s, {attachments} attachments, {metadata} metadata records",
+        to.display()
+    )];
+    let count = recovered
+        .lost
+        .map_or_else(String::new, |lost| format!(", {lost} records"));
+    let kind = if recovered.has_losses() { "lost" } else { "damaged" };
+    lines.extend(recovered.damage.iter().map(|damage| format!("{kind} {damage}")));
+    lines.push(match (recovered.has_losses(), recovered.complete) {
+        (true, _) => format!("DATA WAS LOST{count}"),
+        (false, true) => "nothing was lost".to_owned(),
+        (false, false) => "the recording was not ended; everything written to the file was saved".to_owned(),
+    });
+    lines.join("\n")
 }

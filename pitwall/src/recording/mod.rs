@@ -17,16 +17,20 @@
 //! | `/<car>/{state,health,load,params}` | json | our own |
 //!
 //! The log time is the arrival by the laptop's clock, the publish time is the car's.
+mod error;
 mod foxglove;
 mod note;
 mod reader;
 mod recorder;
 mod recover;
+mod salvage;
+mod summary;
 mod unreadable;
 mod writer;
 
+pub use error::RecordingError;
 pub use reader::{Recording, read_events};
 pub use recorder::{Recorder, RecorderStatus, RecordingProgress};
-pub use recover::{Recovered, recover};
+pub use recover::{Damage, Recovered, recover};
+pub use summary::{RecordingSummary, StreamSummary};
 pub use unreadable::{Unreadable, UnreadableCount};
-pub use writer::{RecordingError, RecordingSummary, StreamSummary};

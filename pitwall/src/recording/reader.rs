@@ -8,11 +8,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use mcap::io::MessageReader;
-use mcap::sans_io::LinearReaderOptions;
 use protocol::{Header, Key, MapReply, Telemetry, Topic, decode};
 
+use super::error::RecordingError;
 use super::note::Note;
-use super::writer::{RecordingError, WIRE_ENCODING};
+use super::salvage::reader_options;
+use super::writer::WIRE_ENCODING;
 use crate::event::{Delivery, EventPayload, FleetEvent};
 
 /// The events of a recording, in the order in which they were written.
@@ -27,7 +28,7 @@ pub struct Recording<R: Read> {
 pub fn read_events(path: &Path) -> Result<Recording<BufReader<File>>, RecordingError> {
     let file = open(path)?;
     Ok(Recording {
-        messages: MessageReader::new_with_options(BufReader::new(file), LinearReaderOptions::default()),
+        messages: MessageReader::new_with_options(BufReader::new(file), reader_options()),
         path: path.to_owned(),
         foreign: BTreeSet::new(),
     })
@@ -104,4 +105,74 @@ fn payload(topic: Topic, data: &[u8]) -> Result<EventPayload, String> {
         header: Header::read(data).ok(),
         error: error.to_string(),
     }))
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::recording::writer::RecordingWriter;
+    use protocol::{Event, EventKind, Stamps, Telemetry, encode};
+    use std::borrow::Cow;
+    use std::io::Cursor;
+
+    /// An event that arrived at `number` \[unix ns\].
+    fn event(number: u64) -> FleetEvent {
+        let event = Event {
+            kind: EventKind::SearchStarted,
+            update: number,
+            who: None,
+            command: None,
+        };
+        let stamps = Stamps {
+            run_id: 1,
+            sequence: number + 1,
+            ..Stamps::default()
+        };
+        let bytes = encode(&event, stamps).expect("a good message");
+        let (header, _) = decode::<Event>(&bytes).expect("our own");
+        FleetEvent {
+            at: number as i64,
+            car: "car-1".parse().expect("a name"),
+            payload: EventPayload::Message {
+                topic: Topic::Event,
+                delivery: Delivery::InOrder,
+                header,
+                telemetry: Box::new(Telemetry::Event(event)),
+                bytes: bytes.into(),
+            },
+        }
+    }
+
+    /// A recording of a hundred events, ten to a chunk, with an attachment and metadata.
+    pub(in super::super) fn small_recording() -> Vec<u8> {
+        let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("begun");
+        for number in 0..100 {
+            recording.write(&event(number)).expect("written");
+            if number % 10 == 9 {
+                recording.flush().expect("flushed");
+            }
+        }
+        let attachment = mcap::Attachment {
+            log_time: 1,
+            create_time: 1,
+            name: "notes.txt".into(),
+            media_type: "text/plain".into(),
+            data: Cow::Borrowed(b"wet track"),
+        };
+        recording.attach(&attachment).expect("written");
+        let (_, bytes) = recording.finish().expect("ended");
+        bytes.into_inner()
+    }
+
+    #[test]
+    fn what_was_written_is_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("session.mcap");
+        std::fs::write(&path, small_recording()).expect("written");
+        let times: Vec<_> = read_events(&path)
+            .expect("opens")
+            .map(|event| event.expect("whole").at)
+            .collect();
+        assert_eq!(times, (0..100).collect::<Vec<_>>());
+    }
 }

@@ -10,13 +10,16 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender};
 use serde::Serialize;
 
-use super::writer::{RecordingError, RecordingSummary, RecordingWriter};
+use super::error::RecordingError;
+use super::summary::RecordingSummary;
+use super::writer::RecordingWriter;
 use crate::event::FleetEvent;
 
-/// How often what was recorded goes to the operating system: a crash of the program loses no more than this.
-const FLUSH_EVERY: Duration = Duration::from_millis(300);
-/// How often it goes to the disk.
-const SYNC_EVERY: Duration = Duration::from_secs(2);
+/// Period at which events are flushed and synced to the disk. A power cut loses the events of one period and of one sync,
+/// which must be less than a second together.
+const SYNC_EVERY: Duration = Duration::from_millis(300);
+/// A sync that takes longer than this is reported, because then a power cut can lose more than a second.
+const SLOW_SYNC: Duration = Duration::from_millis(700);
 /// Events that may wait for a slow disk: about a minute of ten cars.
 const QUEUE: usize = 200_000;
 
@@ -153,23 +156,23 @@ impl Work {
         let path = self.path.clone();
         let io = |e| RecordingError::io(&path, e);
         let mcap = |e| RecordingError::mcap(&path, e);
-        let mut flushed = Instant::now();
-        let mut synced = Instant::now();
+        let mut schedule = SyncSchedule::new(Instant::now());
         loop {
-            match self
-                .queue
-                .recv_timeout(FLUSH_EVERY.saturating_sub(flushed.elapsed()))
-            {
+            match self.queue.recv_timeout(schedule.left(Instant::now())) {
                 Ok(event) => self.recording.write(&event).map_err(mcap)?,
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
-            if flushed.elapsed() >= FLUSH_EVERY {
+            if schedule.due(Instant::now()) {
                 self.recording.flush().map_err(mcap)?;
-                flushed = Instant::now();
-                if synced.elapsed() >= SYNC_EVERY {
-                    self.sync.sync_data().map_err(io)?;
-                    synced = Instant::now();
+                let begun = Instant::now();
+                self.sync.sync_data().map_err(io)?;
+                let took = begun.elapsed();
+                if took > SLOW_SYNC {
+                    tracing::warn!(
+                        ?took,
+                        "the disk is slow: a power cut would lose more than a second"
+                    );
                 }
                 let bytes = self.sync.metadata().map_err(io)?.len();
                 let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
@@ -181,5 +184,51 @@ impl Work {
         drop(writer);
         self.sync.sync_all().map_err(io)?;
         Ok(summary)
+    }
+}
+
+/// When to sync.
+struct SyncSchedule(Instant);
+
+impl SyncSchedule {
+    fn new(now: Instant) -> Self {
+        Self(now)
+    }
+
+    /// Time until the next sync.
+    fn left(&self, now: Instant) -> Duration {
+        SYNC_EVERY.saturating_sub(now.saturating_duration_since(self.0))
+    }
+
+    /// True when it is time to sync; the next period begins then.
+    fn due(&mut self, now: Instant) -> bool {
+        let due = self.left(now).is_zero();
+        if due {
+            self.0 = now;
+        }
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn at_most_a_second_is_not_yet_on_the_disk() {
+        let begin = Instant::now();
+        let mut schedule = SyncSchedule::new(begin);
+        let mut oldest = None;
+        for number in 0..1000 {
+            let now = begin + number * Duration::from_millis(25);
+            let unsynced = *oldest.get_or_insert(now);
+            assert!(
+                now - unsynced + SLOW_SYNC <= Duration::from_secs(1),
+                "event {number}"
+            );
+            if schedule.due(now) {
+                oldest = None;
+            }
+        }
     }
 }

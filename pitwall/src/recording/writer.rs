@@ -1,18 +1,17 @@
 //! Writes one recording.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fmt;
 use std::io::{Seek, Write};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use protocol::{CarName, Key, Topic};
-use serde::Serialize;
 
 use super::foxglove::{self, Exported};
 use super::note::Note;
+use super::summary::{RecordingSummary, StreamSummary};
 use crate::event::{EventPayload, FleetEvent, SentRange};
-use crate::fleet::{GapSummary, SequenceStatus, SequenceTracker};
+use crate::fleet::{SequenceStatus, SequenceTracker};
 
 /// Encoding of messages as they came.
 pub(super) const WIRE_ENCODING: &str = "synpf-v1";
@@ -141,6 +140,11 @@ impl<W: Write + Seek> RecordingWriter<W> {
         Ok(())
     }
 
+    #[cfg(test)]
+    pub(super) fn attach(&mut self, attachment: &mcap::Attachment<'_>) -> Result<(), mcap::McapError> {
+        self.writer.attach(attachment)
+    }
+
     /// Puts everything written so far into the file.
     pub(super) fn flush(&mut self) -> Result<(), mcap::McapError> {
         self.writer.flush()
@@ -258,164 +262,4 @@ struct Times {
     arrived: i64,
     published: i64,
     sequence: u32,
-}
-
-/// What is in a recording, and what is not.
-#[derive(Debug, Clone, PartialEq, Default, Serialize)]
-pub struct RecordingSummary {
-    /// From the first event to the last [s].
-    pub duration_s: f64,
-    /// Messages and notes.
-    pub messages: u64,
-    /// Every stream.
-    pub streams: Vec<StreamSummary>,
-    /// Cars that did not say at the end how far their streams go: what they sent last may be missing, uncounted.
-    pub unanswered: Vec<CarName>,
-}
-
-/// One stream of a recording.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct StreamSummary {
-    /// The car.
-    pub car: CarName,
-    /// The topic.
-    pub topic: Topic,
-    /// How long before the end of the car's recording its last message here was published [s]. The end is when the car
-    /// said how far its streams go, or else its last message on any topic. None where that was before it started again.
-    pub behind_s: Option<f64>,
-    /// What came and what did not.
-    #[serde(flatten)]
-    pub gaps: GapSummary,
-}
-
-impl RecordingSummary {
-    /// Messages that were sent and are not in the file.
-    pub fn missing(&self) -> u64 {
-        self.streams.iter().map(|stream| stream.gaps.missing).sum()
-    }
-}
-
-impl fmt::Display for RecordingSummary {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(
-            f,
-            "{:<12} {:<18} {:>9} {:>9} {:>9} {:>9} {:>9}",
-            "car", "stream", "first", "last", "received", "missing", "behind"
-        )?;
-        for StreamSummary {
-            car,
-            topic,
-            behind_s,
-            gaps,
-        } in &self.streams
-        {
-            let behind = behind_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.2} s"));
-            writeln!(
-                f,
-                "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9} {behind:>9}",
-                gaps.first, gaps.last, gaps.received, gaps.missing
-            )?;
-            for [from, to] in gaps.missing_ranges.iter().take(10) {
-                writeln!(f, "{:<12} {:<18} missing {from} to {to}", "", "")?;
-            }
-            if gaps.missing_ranges.len() > 10 {
-                writeln!(f, "{:<31} and {} more ranges", "", gaps.missing_ranges.len() - 10)?;
-            }
-        }
-        for car in &self.unanswered {
-            writeln!(
-                f,
-                "{car} did not answer at the end: what it sent last may be missing, too"
-            )?;
-        }
-        let missing = match self.missing() {
-            0 => "nothing is missing".to_owned(),
-            1 => "1 message is missing".to_owned(),
-            n => format!("{n} messages are missing"),
-        };
-        write!(
-            f,
-            "{} messages in {:.1} s; {missing}",
-            self.messages, self.duration_s
-        )
-    }
-}
-
-/// Why a recording cannot be written or read.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordingError {
-    /// The file exists: recordings are never overwritten.
-    #[error("{0} exists already; recordings are never overwritten")]
-    Exists(String),
-    /// The file cannot be opened, written or read.
-    #[error("{file}: {reason}")]
-    Io {
-        /// The file.
-        file: String,
-        /// What the system says.
-        reason: std::io::Error,
-    },
-    /// Writing the file failed.
-    #[error("{file}: {reason}")]
-    Mcap {
-        /// The file.
-        file: String,
-        /// What is wrong.
-        reason: mcap::McapError,
-    },
-    /// The file is something else.
-    #[error("{0} is no recording: it does not begin as an MCAP file does")]
-    Foreign(String),
-    /// The file was cut off, or is damaged.
-    #[error("{file}: {reason}; `pitwall recover {file}` saves what can be read")]
-    Broken {
-        /// The file.
-        file: String,
-        /// What is wrong.
-        reason: mcap::McapError,
-    },
-    /// Not one message can be read.
-    #[error("{file}: nothing can be saved, {reason}")]
-    Nothing {
-        /// The file.
-        file: String,
-        /// Why.
-        reason: String,
-    },
-    /// The file is a recording of nothing.
-    #[error("{0} holds no event of any car")]
-    Empty(String),
-}
-
-impl RecordingError {
-    pub(crate) fn io(file: &std::path::Path, reason: std::io::Error) -> Self {
-        let file = file.display().to_string();
-        if reason.kind() == std::io::ErrorKind::AlreadyExists {
-            Self::Exists(file)
-        } else {
-            Self::Io { file, reason }
-        }
-    }
-
-    /// What went wrong while writing.
-    pub(super) fn mcap(file: &std::path::Path, reason: mcap::McapError) -> Self {
-        match reason {
-            mcap::McapError::Io(reason) => Self::io(file, reason),
-            reason => Self::Mcap {
-                file: file.display().to_string(),
-                reason,
-            },
-        }
-    }
-
-    /// What went wrong while reading.
-    pub(super) fn broken(file: &std::path::Path, reason: mcap::McapError) -> Self {
-        match reason {
-            mcap::McapError::Io(reason) => Self::io(file, reason),
-            reason => Self::Broken {
-                file: file.display().to_string(),
-                reason,
-            },
-        }
-    }
 }

@@ -1,0 +1,89 @@
+//! What a finished recording holds and what is missing in it.
+
+use std::fmt;
+
+use protocol::{CarName, Topic};
+use serde::Serialize;
+
+use crate::fleet::GapSummary;
+
+/// What is in a recording, and what is not.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct RecordingSummary {
+    /// From the first event to the last [s].
+    pub duration_s: f64,
+    /// Messages and notes.
+    pub messages: u64,
+    /// Every stream.
+    pub streams: Vec<StreamSummary>,
+    /// Cars that did not say at the end how far their streams go: what they sent last may be missing, uncounted.
+    pub unanswered: Vec<CarName>,
+}
+
+/// One stream of a recording.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StreamSummary {
+    /// The car.
+    pub car: CarName,
+    /// The topic.
+    pub topic: Topic,
+    /// How long before the end of the car's recording its last message here was published [s]. The end is when the car
+    /// said how far its streams go, or else its last message on any topic. None where that was before it started again.
+    pub behind_s: Option<f64>,
+    /// What came and what did not.
+    #[serde(flatten)]
+    pub gaps: GapSummary,
+}
+
+impl RecordingSummary {
+    /// Messages that were sent and are not in the file.
+    pub fn missing(&self) -> u64 {
+        self.streams.iter().map(|stream| stream.gaps.missing).sum()
+    }
+}
+
+impl fmt::Display for RecordingSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{:<12} {:<18} {:>9} {:>9} {:>9} {:>9} {:>9}",
+            "car", "stream", "first", "last", "received", "missing", "behind"
+        )?;
+        for StreamSummary {
+            car,
+            topic,
+            behind_s,
+            gaps,
+        } in &self.streams
+        {
+            let behind = behind_s.map_or_else(|| "-".to_owned(), |s| format!("{s:.2} s"));
+            writeln!(
+                f,
+                "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9} {behind:>9}",
+                gaps.first, gaps.last, gaps.received, gaps.missing
+            )?;
+            for [from, to] in gaps.missing_ranges.iter().take(10) {
+                writeln!(f, "{:<12} {:<18} missing {from} to {to}", "", "")?;
+            }
+            if gaps.missing_ranges.len() > 10 {
+                writeln!(f, "{:<31} and {} more ranges", "", gaps.missing_ranges.len() - 10)?;
+            }
+        }
+        for car in &self.unanswered {
+            writeln!(
+                f,
+                "{car} did not answer at the end: what it sent last may be missing, too"
+            )?;
+        }
+        let missing = match self.missing() {
+            0 => "nothing is missing".to_owned(),
+            1 => "1 message is missing".to_owned(),
+            n => format!("{n} messages are missing"),
+        };
+        write!(
+            f,
+            "{} messages in {:.1} s; {missing}",
+            self.messages, self.duration_s
+        )
+    }
+}

@@ -31,7 +31,7 @@ pub enum RecordingError {
         /// The file.
         file: String,
         /// What is wrong.
-        reason: mcap::McapError,
+        reason: String,
     },
     /// Not one message can be read.
     #[error("{file}: nothing can be saved, {reason}")]
@@ -68,13 +68,10 @@ impl RecordingError {
     }
 
     /// What went wrong while reading.
-    pub(super) fn broken(file: &std::path::Path, reason: mcap::McapError) -> Self {
-        match reason {
-            mcap::McapError::Io(reason) => Self::io(file, reason),
-            reason => Self::Broken {
-                file: file.display().to_string(),
-                reason,
-            },
+    pub(super) fn broken(file: &std::path::Path, reason: String) -> Self {
+        Self::Broken {
+            file: file.display().to_string(),
+            reason,
         }
     }
 }

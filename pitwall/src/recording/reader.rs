@@ -1,36 +1,54 @@
-//! Reads a recording back: the same events as the live pit wall had. A message that cannot be read is an event, too
-//! ([`EventPayload::Unreadable`]), as it is live; a channel that is of no kind known here is passed over with a warning.
+//! Reads a recording: the same events as the live pit wall had.
+//!
+//! A message that cannot be decoded is an event, too ([`EventPayload::Unreadable`]), as it is live. Channels of other
+//! programs are skipped with a warning.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs::File;
-use std::io::{BufReader, ErrorKind, Read, Seek};
+use std::io::{ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use mcap::io::MessageReader;
-use protocol::{Header, Key, MapReply, Telemetry, Topic, decode};
+use mcap::records::{Channel, MessageHeader};
+use protocol::{CarName, Header, Key, MapReply, Telemetry, Topic, decode};
 
 use super::error::RecordingError;
 use super::note::Note;
-use super::salvage::reader_options;
+use super::salvage::{Salvage, Salvaged};
 use super::writer::WIRE_ENCODING;
 use crate::event::{Delivery, EventPayload, FleetEvent};
 
-/// The events of a recording, in the order in which they were written.
-pub struct Recording<R: Read> {
-    messages: MessageReader<R>,
+/// The events of a recording, in the order in which they were written. The first error is the last item.
+pub struct Recording {
     path: PathBuf,
-    /// Channels that were passed over.
-    foreign: BTreeSet<String>,
+    salvage: Salvage<File>,
+    /// Records that are read and not yet handled.
+    records: VecDeque<Salvaged>,
+    channels: BTreeMap<u16, Channel>,
+    progress: Progress,
+    /// Channels that are skipped.
+    skipped: BTreeSet<String>,
 }
 
-/// Opens a recording. An unfinished one is an error at its end: [`recover`](super::recover()) it first.
-pub fn read_events(path: &Path) -> Result<Recording<BufReader<File>>, RecordingError> {
+#[derive(PartialEq)]
+enum Progress {
+    Data,
+    /// The summary repeats the channels and has no messages.
+    Summary,
+    /// The end was reached, or an error was returned.
+    Done,
+}
+
+/// Opens a recording. An unfinished one ends with an error: [`recover`](super::recover()) it first.
+pub fn read_events(path: &Path) -> Result<Recording, RecordingError> {
     let file = open(path)?;
     Ok(Recording {
-        messages: MessageReader::new_with_options(BufReader::new(file), reader_options()),
         path: path.to_owned(),
-        foreign: BTreeSet::new(),
+        salvage: Salvage::new(file).map_err(|e| RecordingError::io(path, e))?,
+        records: VecDeque::new(),
+        channels: BTreeMap::new(),
+        progress: Progress::Data,
+        skipped: BTreeSet::new(),
     })
 }
 
@@ -48,40 +66,86 @@ pub(super) fn open(path: &Path) -> Result<File, RecordingError> {
     Ok(file)
 }
 
-impl<R: Read> Iterator for Recording<R> {
+impl Iterator for Recording {
     type Item = Result<FleetEvent, RecordingError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        loop {
-            let message = match self.messages.next()? {
-                Ok(message) => message,
-                Err(error) => return Some(Err(RecordingError::broken(&self.path, error))),
-            };
-            let channel = message.channel.topic.as_str();
-            let at = message.log_time as i64;
-            let event = if message.channel.message_encoding == WIRE_ENCODING {
-                let key = channel.parse::<Key>().map_err(|e| e.to_string());
-                key.and_then(|key| Ok((payload(key.topic, &message.data)?, key.car)))
-            } else if let Some(car) = Note::car(channel) {
-                let note = serde_json::from_slice::<Note>(&message.data);
-                note.map(|note| (note.into(), car)).map_err(|e| e.to_string())
-            } else {
-                // For other tools.
-                continue;
-            };
-            match event {
-                Ok((payload, car)) => return Some(Ok(FleetEvent { at, car, payload })),
-                Err(error) => {
-                    if self.foreign.insert(channel.to_owned()) {
-                        tracing::warn!(channel, error, "passed over; was it recorded by a newer pitwall?");
+        let next = self.next_event().transpose();
+        if !matches!(next, Some(Ok(_))) {
+            self.progress = Progress::Done;
+        }
+        next
+    }
+}
+
+impl Recording {
+    /// The next event; None at the end of a complete recording.
+    fn next_event(&mut self) -> Result<Option<FleetEvent>, RecordingError> {
+        while self.progress != Progress::Done {
+            match self.next_record()? {
+                Salvaged::Channel(channel) if self.progress == Progress::Data => {
+                    self.channels.insert(channel.id, channel);
+                }
+                Salvaged::Message(header, data) => {
+                    if let Some(event) = self.event(&header, &data)? {
+                        return Ok(Some(event));
                     }
                 }
+                Salvaged::DataEnd => self.progress = Progress::Summary,
+                Salvaged::Complete => return Ok(None),
+                Salvaged::Damage(reason) => return Err(RecordingError::broken(&self.path, reason)),
+                _ => {}
+            }
+        }
+        Ok(None)
+    }
+
+    fn next_record(&mut self) -> Result<Salvaged, RecordingError> {
+        if self.records.is_empty() {
+            let records = self.salvage.next(true);
+            self.records = records.map_err(|e| RecordingError::io(&self.path, e))?.into();
+        }
+        let cut_off = || RecordingError::broken(&self.path, "the file was cut off".to_owned());
+        self.records.pop_front().ok_or_else(cut_off)
+    }
+
+    /// The event that a message holds; None for one that is for other programs.
+    fn event(&mut self, header: &MessageHeader, data: &[u8]) -> Result<Option<FleetEvent>, RecordingError> {
+        let Some(channel) = self.channels.get(&header.channel_id) else {
+            let reason = format!("a message is on the unknown channel {}", header.channel_id);
+            return Err(RecordingError::broken(&self.path, reason));
+        };
+        let decoded = if channel.message_encoding == WIRE_ENCODING {
+            wire_message(&channel.topic, data)
+        } else if let Some(car) = Note::car(&channel.topic) {
+            let note = serde_json::from_slice::<Note>(data);
+            note.map(|note| (note.into(), car)).map_err(|e| e.to_string())
+        } else {
+            return Ok(None);
+        };
+        match decoded {
+            Ok((payload, car)) => Ok(Some(FleetEvent {
+                at: header.log_time as i64,
+                car,
+                payload,
+            })),
+            Err(error) => {
+                let channel = channel.topic.as_str();
+                if self.skipped.insert(channel.to_owned()) {
+                    tracing::warn!(channel, error, "skipped; was it recorded by a newer pitwall?");
+                }
+                Ok(None)
             }
         }
     }
 }
 
-/// What a message as it came says. An error for a topic that is not recorded.
+fn wire_message(channel: &str, data: &[u8]) -> Result<(EventPayload, CarName), String> {
+    let key = channel.parse::<Key>().map_err(|e| e.to_string())?;
+    Ok((payload(key.topic, data)?, key.car))
+}
+
+/// The payload of a message as it came. An error for a topic that is not recorded.
 fn payload(topic: Topic, data: &[u8]) -> Result<EventPayload, String> {
     let bytes = || data.into();
     let payload = if topic == Topic::Map {
@@ -162,6 +226,19 @@ pub(super) mod tests {
         recording.attach(&attachment).expect("written");
         let (_, bytes) = recording.finish().expect("ended");
         bytes.into_inner()
+    }
+
+    #[test]
+    fn a_file_cut_off_between_two_records_ends_with_one_error() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("session.mcap");
+        let bytes = small_recording();
+        // Without its end mark, the file ends after a whole record.
+        std::fs::write(&path, &bytes[..bytes.len() - mcap::MAGIC.len()]).expect("written");
+        let events: Vec<_> = read_events(&path).expect("opens").collect();
+        assert_eq!(events.len(), 101);
+        let error = events[100].as_ref().err().expect("the last").to_string();
+        assert!(error.contains("session.mcap: the file was cut off"), "{error}");
     }
 
     #[test]

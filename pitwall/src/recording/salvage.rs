@@ -4,6 +4,7 @@
 //! Chunks are verified by their checksum before anything in them is used. Record lengths are checked against the file
 //! and against [`RECORD_LIMIT`] before memory is allocated.
 
+use std::borrow::Borrow;
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt;
@@ -13,17 +14,10 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{Attachment, MAGIC};
 
 /// The largest record and the largest decompressed chunk that is read \[bytes\].
-pub(super) const RECORD_LIMIT: usize = 256 * 1024 * 1024;
+const RECORD_LIMIT: usize = 256 * 1024 * 1024;
 
 /// Opcode and length of a record \[bytes\].
 const PREFIX: u64 = 9;
-
-/// Options for every MCAP reader: limited lengths, and checksums verified before a chunk is used.
-pub(super) fn reader_options() -> LinearReaderOptions {
-    LinearReaderOptions::default()
-        .with_record_length_limit(RECORD_LIMIT)
-        .with_prevalidate_chunk_crcs(true)
-}
 
 /// An intact record, or a place where something is lost.
 #[derive(Debug)]
@@ -51,18 +45,18 @@ pub(super) enum Salvaged {
 }
 
 /// Walks through the records of a file.
-pub(super) struct Salvage<'a> {
-    file: &'a File,
+pub(super) struct Salvage<F> {
+    file: F,
     len: u64,
     at: u64,
 }
 
-impl<'a> Salvage<'a> {
+impl<F: Borrow<File>> Salvage<F> {
     /// Begins after the start mark, which the caller has checked.
-    pub(super) fn new(file: &'a File) -> io::Result<Self> {
+    pub(super) fn new(file: F) -> io::Result<Self> {
         Ok(Self {
+            len: file.borrow().metadata()?.len(),
             file,
-            len: file.metadata()?.len(),
             at: MAGIC.len() as u64,
         })
     }
@@ -185,7 +179,7 @@ impl<'a> Salvage<'a> {
 
     fn bytes(&self, at: u64, len: u64) -> io::Result<Vec<u8>> {
         let mut bytes = vec![0; len as usize];
-        self.file.read_exact_at(&mut bytes, at)?;
+        self.file.borrow().read_exact_at(&mut bytes, at)?;
         Ok(bytes)
     }
 }
@@ -322,7 +316,9 @@ fn parse(opcode: u8, body: Vec<u8>) -> Option<Salvaged> {
 
 /// The records of a chunk. A chunk with a wrong checksum gives none; one without a checksum gives those before the fault.
 fn read_chunk(body: &[u8]) -> Vec<Salvaged> {
-    let options = reader_options()
+    let options = LinearReaderOptions::default()
+        .with_record_length_limit(RECORD_LIMIT)
+        .with_prevalidate_chunk_crcs(true)
         .with_skip_start_magic(true)
         .with_skip_end_magic(true);
     let mut reader = LinearReader::new_with_options(options);

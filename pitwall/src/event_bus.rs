@@ -1,6 +1,6 @@
-//! Where events arrive: the fleet, a recording that may be going on, and whoever else listens.
+//! Distributes events to the fleet, the recorder and the subscribers, to all of them in the same order.
 //!
-//! Live events and a replay's go the same way, [`EventBus::take`].
+//! Live events and those of a replay take the same path, [`EventBus::publish`].
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,23 +9,26 @@ use crossbeam_channel::{Receiver, Sender, TrySendError};
 
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
-use crate::recording::{Recorder, RecordingProgress};
+use crate::recording::{Recorder, RecorderStatus, RecordingProgress};
 
 /// The state of all cars, shared by those who fill it and those who show it.
+///
+/// One lock guards the fleet, the recorder and the subscribers. The order in which a recording has the events is
+/// therefore the order in which the fleet applied them, and a recording starts without a gap after the known state.
 #[derive(Default)]
 pub struct EventBus {
     state: Mutex<State>,
-    recorder: Mutex<Option<Recorder>>,
-    subscribers: Mutex<Vec<Sender<Arc<FleetEvent>>>>,
 }
 
 #[derive(Default)]
 struct State {
     fleet: Fleet,
     epoch: u64,
+    recorder: Option<Recorder>,
+    subscribers: Vec<Sender<Arc<FleetEvent>>>,
 }
 
-/// The fleet, held. What comes in meanwhile waits.
+/// The locked fleet. Incoming events wait until it is dropped.
 pub struct FleetGuard<'a>(MutexGuard<'a, State>);
 
 impl std::ops::Deref for FleetGuard<'_> {
@@ -43,45 +46,92 @@ impl std::ops::DerefMut for FleetGuard<'_> {
 }
 
 impl FleetGuard<'_> {
-    /// Counts how often the fleet was begun anew.
+    /// Number of times that the whole fleet was replaced.
     pub fn epoch(&self) -> u64 {
         self.0.epoch
     }
 }
 
 impl EventBus {
-    /// What is known. Hold it briefly.
+    /// Locks the fleet. Hold the lock briefly, and call no other method of the bus meanwhile.
     pub fn fleet(&self) -> FleetGuard<'_> {
-        FleetGuard(self.state.lock().unwrap_or_else(PoisonError::into_inner))
+        FleetGuard(self.lock())
     }
 
-    /// Takes in an event and hands it on to the recorder and to all subscribers.
+    /// Applies an event to the fleet, records it and sends it to all subscribers.
     pub fn publish(&self, event: FleetEvent) {
-        self.fleet().apply(&event);
+        let mut state = self.lock();
+        state.fleet.apply(&event);
         let event = Arc::new(event);
-        if let Some(recorder) = &*self.recorder() {
+        if let Some(recorder) = &state.recorder {
             recorder.record(&event);
         }
-        let mut subscribers = self.subscribers.lock().unwrap_or_else(PoisonError::into_inner);
-        subscribers.retain(|subscriber| {
-            !matches!(
-                subscriber.try_send(event.clone()),
-                Err(TrySendError::Disconnected(_))
-            )
-        });
+        state.send(&[event]);
     }
 
-    /// Puts `fleet` in place of what was known: a replay has jumped to `at` [unix ns]. Taps are told what a newcomer
-    /// needs to know: they have not seen what lies between.
+    /// Replaces the whole fleet, because a replay has jumped to `at` \[unix ns\]. Subscribers get the new state of the cars:
+    /// they have not seen the events between.
     pub fn replace_fleet(&self, fleet: Fleet, at: i64) {
-        {
-            let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-            state.fleet = fleet;
-            state.epoch += 1;
+        let mut state = self.lock();
+        state.fleet = fleet;
+        state.epoch += 1;
+        let events = state.current_events(at);
+        state.send(&events);
+    }
+
+    /// Subscribes to every event from now on, preceded by the current state of the cars. A subscriber that reads too
+    /// slowly misses events.
+    pub fn subscribe(&self, now: i64) -> Receiver<Arc<FleetEvent>> {
+        const CAPACITY: usize = 20_000;
+        let (subscriber, events) = crossbeam_channel::bounded(CAPACITY);
+        let mut state = self.lock();
+        for event in state.current_events(now) {
+            drop(subscriber.try_send(event));
         }
-        let events: Vec<_> = self.current_state(at).into_iter().map(Arc::new).collect();
-        let mut subscribers = self.subscribers.lock().unwrap_or_else(PoisonError::into_inner);
-        subscribers.retain(|subscriber| {
+        state.subscribers.push(subscriber);
+        events
+    }
+
+    /// The file of the current recording and its progress; None when nothing is being recorded.
+    pub fn recording(&self) -> Option<(PathBuf, RecordingProgress)> {
+        let state = self.lock();
+        let recorder = state.recorder.as_ref()?;
+        Some((recorder.path().to_owned(), recorder.progress()))
+    }
+
+    /// The state of the current recording; None when nothing is being recorded.
+    pub(crate) fn recorder_status(&self) -> Option<RecorderStatus> {
+        self.lock().recorder.as_ref().map(Recorder::status)
+    }
+
+    /// Starts to record at `at` \[unix ns\]: first the current state of the cars, then every event after it. Gives the
+    /// recorder back when another one is running.
+    pub(crate) fn attach_recorder(&self, recorder: Recorder, at: i64) -> Result<(), Recorder> {
+        let mut state = self.lock();
+        if state.recorder.is_some() {
+            return Err(recorder);
+        }
+        for event in state.current_events(at) {
+            recorder.record(&event);
+        }
+        state.recorder = Some(recorder);
+        Ok(())
+    }
+
+    /// Stops to record. The recorder still has to be finished.
+    pub(crate) fn detach_recorder(&self) -> Option<Recorder> {
+        self.lock().recorder.take()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    /// Sends events to all subscribers and forgets those that are gone.
+    fn send(&mut self, events: &[Arc<FleetEvent>]) {
+        self.subscribers.retain(|subscriber| {
             events.iter().all(|event| {
                 !matches!(
                     subscriber.try_send(event.clone()),
@@ -91,44 +141,16 @@ impl EventBus {
         });
     }
 
-    /// Every event from now on, after what a newcomer needs to know. One that reads too slowly misses some.
-    pub fn subscribe(&self, now: i64) -> Receiver<Arc<FleetEvent>> {
-        const WAITING: usize = 20_000;
-        let (subscriber, events) = crossbeam_channel::bounded(WAITING);
-        for event in self.current_state(now) {
-            drop(subscriber.try_send(Arc::new(event)));
-        }
-        self.subscribers
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(subscriber);
-        events
-    }
-
-    /// The file that is being recorded into, and how that is getting on.
-    pub fn recording(&self) -> Option<(PathBuf, RecordingProgress)> {
-        let recorder = self.recorder();
-        recorder
-            .as_ref()
-            .map(|recorder| (recorder.path().to_owned(), recorder.progress()))
-    }
-
-    /// The recording that is going on.
-    pub(crate) fn recorder(&self) -> MutexGuard<'_, Option<Recorder>> {
-        self.recorder.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// What a recording that begins at `at` [unix ns] would otherwise not know.
-    pub(crate) fn current_state(&self, at: i64) -> Vec<FleetEvent> {
-        let fleet = self.fleet();
+    /// Events at `at` \[unix ns\] that describe the cars to a recording or a subscriber that starts now.
+    fn current_events(&self, at: i64) -> Vec<Arc<FleetEvent>> {
         let mut events = Vec::new();
-        for car in fleet.cars() {
+        for car in self.fleet.cars() {
             let mut push = |payload| {
-                events.push(FleetEvent {
+                events.push(Arc::new(FleetEvent {
                     at,
                     car: car.name.clone(),
                     payload,
-                });
+                }));
             };
             if car.alive {
                 push(EventPayload::Appeared);
@@ -153,9 +175,119 @@ impl EventBus {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::recording::read_events;
+    use std::sync::Barrier;
+
+    fn marker(text: &str) -> FleetEvent {
+        FleetEvent {
+            at: 1,
+            car: "car-1".parse().expect("a name"),
+            payload: EventPayload::Marker {
+                who: "ana".into(),
+                text: text.into(),
+            },
+        }
+    }
+
+    fn text(event: &FleetEvent) -> Option<String> {
+        match &event.payload {
+            EventPayload::Marker { text, .. } => Some(text.to_string()),
+            _ => None,
+        }
+    }
+
+    /// Publishes markers from four threads at once.
+    fn publish_from_threads(bus: &EventBus, count: usize) {
+        const THREADS: usize = 4;
+        let start = Barrier::new(THREADS);
+        std::thread::scope(|scope| {
+            for thread in 0..THREADS {
+                let start = &start;
+                scope.spawn(move || {
+                    start.wait();
+                    for number in 0..count {
+                        bus.publish(marker(&format!("{thread}-{number}")));
+                    }
+                });
+            }
+        });
+    }
+
+    // The fleet, the recorder and the subscribers once had a lock each, and got the events of two threads in two orders.
+    #[test]
+    fn all_receive_the_events_in_the_same_order() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("session.mcap");
+        let bus = EventBus::default();
+        let recorder = Recorder::start(&path).expect("begun");
+        bus.attach_recorder(recorder, 0).ok().expect("the only one");
+        let events = bus.subscribe(0);
+        publish_from_threads(&bus, 400);
+        let applied: Vec<_> = bus
+            .fleet()
+            .log()
+            .since(0)
+            .filter(|entry| entry.kind == "marker")
+            .map(|entry| entry.text.clone())
+            .collect();
+        assert_eq!(applied.len(), 1600);
+        let received: Vec<_> = events.try_iter().filter_map(|event| text(&event)).collect();
+        assert!(received == applied, "subscribers");
+        let recorder = bus.detach_recorder().expect("a recorder");
+        recorder.finish().expect("written");
+        let recorded: Vec<_> = read_events(&path)
+            .expect("opens")
+            .filter_map(|event| text(&event.expect("whole")))
+            .collect();
+        assert!(recorded == applied, "recording");
+    }
 
     #[test]
-    fn after_a_jump_a_tap_knows_the_cars() {
+    fn a_recording_that_starts_among_events_has_the_cars_first() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let bus = EventBus::default();
+        let appeared = |number: usize| FleetEvent {
+            at: 1,
+            car: format!("car-{number}").parse().expect("a name"),
+            payload: EventPayload::Appeared,
+        };
+        for round in 0..20 {
+            let path = folder.path().join(format!("{round}.mcap"));
+            let recorder = Recorder::start(&path).expect("begun");
+            let start = Barrier::new(2);
+            std::thread::scope(|scope| {
+                scope.spawn(|| {
+                    start.wait();
+                    for number in 0..20 {
+                        bus.publish(appeared(20 * round + number));
+                    }
+                });
+                start.wait();
+                bus.attach_recorder(recorder, 0).ok().expect("the only one");
+            });
+            let recorder = bus.detach_recorder().expect("a recorder");
+            recorder.finish().expect("written");
+            let recorded = read_events(&path).expect("opens").count();
+            assert_eq!(recorded, 20 * (round + 1), "each car once");
+        }
+    }
+
+    #[test]
+    fn a_second_recorder_is_given_back() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let bus = EventBus::default();
+        let [first, second] =
+            ["first", "second"].map(|name| Recorder::start(&folder.path().join(name)).expect("begun"));
+        assert!(bus.attach_recorder(first, 0).is_ok());
+        let rejected = bus.attach_recorder(second, 0).err().expect("given back");
+        assert!(rejected.path().ends_with("second"));
+        rejected.finish().expect("ended");
+        let first = bus.detach_recorder().expect("the first");
+        first.finish().expect("ended");
+    }
+
+    #[test]
+    fn after_a_jump_a_subscriber_gets_the_cars() {
         let bus = EventBus::default();
         let events = bus.subscribe(0);
         assert!(events.is_empty());
@@ -166,7 +298,7 @@ mod tests {
             payload: EventPayload::Appeared,
         });
         bus.replace_fleet(fleet, 5);
-        let event = events.try_recv().expect("what a newcomer needs to know");
+        let event = events.try_recv().expect("the state of the car");
         assert_eq!((event.at, event.car.as_str()), (5, "car-1"));
     }
 }

@@ -104,14 +104,18 @@ impl FleetService {
 
     /// Starts a recording of all cars. It begins with the known maps, info and clock offsets.
     pub async fn start_recording(&self, path: &Path) -> Result<(), StartRecordingError> {
-        if self.bus.recorder().is_some() {
+        if self.bus.recording().is_some() {
             return Err(StartRecordingError::Recording);
         }
         let recorder = Recorder::start(path)?;
-        for event in self.bus.current_state(unix_now()) {
-            recorder.record(&Arc::new(event));
+        if let Err(rejected) = self.bus.attach_recorder(recorder, unix_now()) {
+            // Another recording has started since the check. The new file holds nothing.
+            drop(rejected);
+            if let Err(error) = std::fs::remove_file(path) {
+                tracing::warn!(file = %path.display(), %error, "an empty recording is left");
+            }
+            return Err(StartRecordingError::Recording);
         }
-        *self.bus.recorder() = Some(recorder);
         self.connection.subscribe_recorded(true).await?;
         Ok(())
     }
@@ -130,7 +134,7 @@ impl FleetService {
         if let Err(error) = self.connection.subscribe_recorded(false).await {
             tracing::warn!(%error, "still subscribed to the full-rate topics");
         }
-        let recorder = self.bus.recorder().take()?;
+        let recorder = self.bus.detach_recorder()?;
         tokio::task::spawn_blocking(move || recorder.finish()).await.ok()
     }
 
@@ -155,13 +159,12 @@ impl FleetService {
 
     /// The state of the recording; None when nothing is being recorded.
     pub fn recording(&self) -> Option<RecorderStatus> {
-        self.bus.recorder().as_ref().map(Recorder::status)
+        self.bus.recorder_status()
     }
 
     /// The file that is being recorded.
     pub fn recording_path(&self) -> Option<PathBuf> {
-        let recorder = self.bus.recorder();
-        recorder.as_ref().map(|recorder| recorder.path().to_owned())
+        self.bus.recording().map(|(path, _)| path)
     }
 
     /// Marks this moment in the log and the recording.

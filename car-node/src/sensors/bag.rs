@@ -12,6 +12,7 @@ use synpf::{Odometry, Scan, Stamp, YawRate};
 use crate::ros2::messages::{self, CdrError, Imu, LaserScan, PoseStamped, RosOdometry, TfMessage};
 use crate::ros2::pose_publisher;
 use crate::sensors::frames::{Frames, Mount};
+use crate::sensors::mcap_reader::McapReader;
 
 /// One message for the localizer.
 #[derive(Debug, Clone, PartialEq)]
@@ -267,7 +268,7 @@ impl Bag {
             source,
         })?;
         let mut topics = BTreeMap::<String, Messages>::new();
-        let reader = mcap::io::MessageReader::new(BufReader::new(file));
+        let reader = McapReader::new(BufReader::new(file));
         for (count, message) in reader.enumerate() {
             let message = message.map_err(|source| BagError::Mcap {
                 path: path.into(),
@@ -477,5 +478,47 @@ impl Bag {
                 present.join(", ")
             },
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_damaged_bag_is_an_error_that_names_the_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("drive.mcap");
+        let mut writer = mcap::Writer::new(io::Cursor::new(Vec::new())).expect("begun");
+        let channel = writer
+            .add_channel(0, "/chatter", "cdr", &BTreeMap::new())
+            .expect("added");
+        let header = mcap::records::MessageHeader {
+            channel_id: channel,
+            sequence: 1,
+            log_time: 1,
+            publish_time: 1,
+        };
+        writer.write_to_known_channel(&header, b"hello").expect("written");
+        writer.finish().expect("ended");
+        let bytes = writer.into_inner().into_inner();
+        std::fs::write(&path, &bytes).expect("written");
+        assert!(Bag::read(&path).is_ok());
+
+        let chunk = bytes
+            .windows(4)
+            .position(|part| part == b"zstd")
+            .expect("a chunk");
+        // The highest byte of the chunk's compressed size, and a byte of its content.
+        for at in [chunk + 4 + 7, chunk + 4 + 8 + 8] {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 0xff;
+            std::fs::write(&path, &damaged).expect("written");
+            let text = Bag::read(&path).expect_err("damaged").to_string();
+            assert!(text.contains("drive.mcap: not a readable MCAP file"), "{text}");
+        }
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).expect("written");
+        let text = Bag::read(&path).expect_err("cut off").to_string();
+        assert!(text.contains("drive.mcap"), "{text}");
     }
 }

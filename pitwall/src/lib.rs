@@ -19,6 +19,7 @@ mod event_bus;
 mod fleet;
 mod fleet_service;
 mod network;
+mod number_ranges;
 mod output;
 mod program;
 mod recording;

@@ -1,13 +1,13 @@
-//! Which sequence numbers of a stream have come, and which are missing.
-
-use std::ops::RangeInclusive;
+//! Tracks which sequence numbers of a stream have arrived and which are missing.
 
 use serde::Serialize;
 
+use crate::number_ranges::NumberRanges;
+
 /// The arrivals of one stream: one sender, one key.
 ///
-/// Counting begins with the first message that comes in: what was sent before that is not missing. A sender that
-/// starts again, which its run_id tells, begins a new count; what was missing of the old one stays missing.
+/// Counting begins with the first message that arrives: what was sent before it is not missing. A sender that restarts
+/// has a higher `run_id` and begins a new count. What was missing from earlier runs stays missing.
 #[derive(Debug, Clone, Default)]
 pub struct SequenceTracker {
     run_id: u64,
@@ -15,31 +15,31 @@ pub struct SequenceTracker {
     last: u64,
     received: u64,
     restarts: u64,
-    /// Missing ranges of the present run_id, ascending.
-    missing: Vec<RangeInclusive<u64>>,
-    /// Missing numbers of earlier runs, and of ranges that no longer fit the list.
+    /// Missing numbers of the current run.
+    missing: NumberRanges,
+    /// Missing numbers of earlier runs, and of ranges beyond [`Self::MAX_RANGES`].
     missing_before: u64,
     filled: u64,
 }
 
-/// What an arrival was.
+/// The place of an arrival in its stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SequenceStatus {
-    /// The next one, or the first.
+    /// The next number, or the first one.
     New,
-    /// A later one: some before it are missing.
+    /// A higher number: some before it are missing.
     AfterGap,
-    /// An earlier one that was missing until now.
+    /// A lower number that was missing until now.
     Late,
-    /// One that had come already, or was sent before the count began.
+    /// A number that has arrived already, or was sent before the count began.
     Duplicate,
 }
 
 impl SequenceTracker {
-    /// A stream with more holes than this is counted, not listed.
+    /// Beyond this many missing ranges, the oldest are counted and no longer listed.
     const MAX_RANGES: usize = 4096;
 
-    /// Takes note of a message. Those with sequence number 0 are not counted.
+    /// Notes an arrival. Messages with sequence number 0 are not counted.
     pub fn arrive(&mut self, run_id: u64, sequence: u64) -> SequenceStatus {
         if sequence == 0 {
             return SequenceStatus::New;
@@ -55,7 +55,7 @@ impl SequenceTracker {
         if sequence > self.last {
             let gap = sequence > self.last + 1;
             if gap {
-                self.miss(self.last + 1..=sequence - 1);
+                self.miss([self.last + 1, sequence - 1]);
             }
             self.last = sequence;
             self.received += 1;
@@ -65,116 +65,106 @@ impl SequenceTracker {
                 SequenceStatus::New
             };
         }
-        let Some(at) = self.missing.iter().position(|range| range.contains(&sequence)) else {
+        if !self.missing.remove(sequence) {
             return SequenceStatus::Duplicate;
-        };
-        let range = self.missing.remove(at);
-        let rest = [*range.start()..=sequence - 1, sequence + 1..=*range.end()];
-        for part in rest.into_iter().rev().filter(|part| !part.is_empty()) {
-            self.missing.insert(at, part);
         }
         self.received += 1;
         self.filled += 1;
         SequenceStatus::Late
     }
 
-    /// Takes note that the messages up to number `to` were sent. Where none has come yet, the count begins with `from`.
+    /// Notes that messages up to number `to` were sent. If none has arrived yet, the count begins with `from`.
     pub fn sent(&mut self, run_id: u64, from: u64, to: u64) {
         if run_id < self.run_id || to < from || from == 0 {
             return;
         }
         if self.last == 0 || run_id > self.run_id {
             self.begin(run_id, from);
-            self.miss(from..=to);
+            self.miss([from, to]);
         } else if to > self.last {
-            self.miss(self.last + 1..=to);
+            self.miss([self.last + 1, to]);
         }
         self.last = self.last.max(to);
     }
 
-    /// Begins with this number of a run_id.
+    /// Begins the count of a run with this number.
     fn begin(&mut self, run_id: u64, number: u64) {
         if self.last > 0 {
             self.restarts += 1;
-            self.missing_before += self.missing_now();
+            self.missing_before += self.missing.count();
             self.missing.clear();
-            // A new sender's first message is number 1: what precedes the one that came is missing.
-            if number > 1 {
-                self.missing.push(1..=number - 1);
-            }
+            // A new run begins with number 1: what precedes this number is missing.
+            self.missing.insert([1, number - 1], ());
         }
         self.run_id = run_id;
         self.first = number;
         self.last = number;
     }
 
-    fn miss(&mut self, range: RangeInclusive<u64>) {
-        if self.missing.len() == Self::MAX_RANGES {
-            let oldest = self.missing.remove(0);
-            self.missing_before += oldest.end() - oldest.start() + 1;
+    fn miss(&mut self, range: [u64; 2]) {
+        if self.missing.range_count() == Self::MAX_RANGES
+            && let Some([from, to]) = self.missing.pop_first()
+        {
+            self.missing_before += to - from + 1;
         }
-        self.missing.push(range);
+        self.missing.insert(range, ());
     }
 
-    /// Different messages that came.
+    /// Messages that arrived, duplicates not counted.
     pub fn received(&self) -> u64 {
         self.received
     }
 
-    /// Messages that were missing for a while and came late.
+    /// Messages that were missing for a while and arrived late.
     pub fn filled(&self) -> u64 {
         self.filled
     }
 
-    /// How often the sender started again.
+    /// How often the sender restarted.
     pub fn restarts(&self) -> u64 {
         self.restarts
     }
 
-    /// Messages missing in all.
+    /// Messages that are missing.
     pub fn missing(&self) -> u64 {
-        self.missing_before + self.missing_now()
+        self.missing_before + self.missing.count()
     }
 
-    /// The highest number that came or is known to have been sent.
+    /// The highest number that arrived or is known to have been sent.
     pub fn last(&self) -> u64 {
         self.last
     }
 
-    /// What there is and what is missing, for people and files.
+    /// The counts and the missing ranges, for people and files.
     pub fn summary(&self) -> GapSummary {
         GapSummary {
             first: self.first,
             last: self.last,
             received: self.received,
             missing: self.missing(),
-            missing_ranges: self.missing.iter().map(|r| [*r.start(), *r.end()]).collect(),
+            missing_ranges: self.missing.iter().collect(),
             filled_late: self.filled,
             sender_restarts: self.restarts,
         }
     }
-
-    fn missing_now(&self) -> u64 {
-        self.missing.iter().map(|r| r.end() - r.start() + 1).sum()
-    }
 }
 
-/// What came of a stream and what did not.
+/// What arrived of a stream and what is missing.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct GapSummary {
-    /// The number with which the count begins, of the sender's last run_id.
+    /// The number with which the count of the last run begins.
     pub first: u64,
-    /// The highest number that came or is known to have been sent.
+    /// The highest number that arrived or is known to have been sent.
     pub last: u64,
-    /// Different messages that came.
+    /// Messages that arrived, duplicates not counted.
     pub received: u64,
-    /// Messages missing in all.
+    /// Messages that are missing.
     pub missing: u64,
-    /// The missing numbers of the sender's last run_id, as `[from, to]`.
+    /// The missing numbers of the last run, as `[from, to]`.
     pub missing_ranges: Vec<[u64; 2]>,
-    /// Messages that came late.
+    /// Messages that arrived late.
     pub filled_late: u64,
-    /// How often the sender started again.
+    /// How often the sender restarted.
     pub sender_restarts: u64,
 }
 
@@ -197,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_is_named_and_fills_from_anywhere() {
+    fn a_gap_is_listed_and_fills_in_any_order() {
         let mut gaps = gaps(&[1, 2, 7]);
         assert_eq!(gaps.summary().missing_ranges, [[3, 6]]);
         assert_eq!(gaps.arrive(1, 4), SequenceStatus::Late);
@@ -211,13 +201,13 @@ mod tests {
     }
 
     #[test]
-    fn a_sender_that_starts_again_counts_anew_and_forgives_nothing() {
+    fn a_sender_that_restarts_begins_a_new_count_and_keeps_what_was_missing() {
         let mut gaps = gaps(&[1, 3]);
         assert_eq!(gaps.arrive(2, 3), SequenceStatus::New);
         assert_eq!(
             gaps.arrive(1, 2),
             SequenceStatus::Duplicate,
-            "a straggler of the old run_id"
+            "a late message of the old run"
         );
         let summary = gaps.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (3, 1));
@@ -225,7 +215,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_known_to_have_been_sent_is_missing_until_it_comes() {
+    fn what_was_sent_is_missing_until_it_arrives() {
         let mut gaps = gaps(&[5, 6]);
         gaps.sent(1, 5, 6);
         assert_eq!(gaps.missing(), 0);
@@ -245,14 +235,14 @@ mod tests {
         let summary = nothing_came.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (4, 1));
         nothing_came.sent(1, 1, 9);
-        assert_eq!(nothing_came.summary(), summary, "a straggler of the old run_id");
+        assert_eq!(nothing_came.summary(), summary, "a late message of the old run");
     }
 
     #[test]
-    fn endless_holes_take_no_endless_memory() {
+    fn the_number_of_missing_ranges_is_limited() {
         let sequences: Vec<_> = (0..10_000).map(|i| 2 * i + 1).collect();
         let gaps = gaps(&sequences);
         assert_eq!(gaps.missing(), 9_999);
-        assert_eq!(gaps.missing.len(), SequenceTracker::MAX_RANGES);
+        assert_eq!(gaps.missing.range_count(), SequenceTracker::MAX_RANGES);
     }
 }

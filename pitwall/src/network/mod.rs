@@ -5,7 +5,8 @@
 //! | `role.rs` | router or client, and the zenoh configuration of each |
 //! | `connection.rs` | opens the zenoh session and subscribes |
 //! | `decoder.rs` | a thread that decodes messages, puts them in order and finds gaps |
-//! | `gap_recovery/` | which messages are missing and when to query for them; pure |
+//! | `reorder_buffer.rs` | puts the messages of a stream in order and tracks which are missing; pure |
+//! | `gap_recovery.rs` | decides which missing messages to request, and when; pure |
 //! | `query.rs` | one query to a car |
 //! | `client.rs` | queries and commands to a car |
 //! | `verdict.rs` | the outcome of a command |
@@ -16,6 +17,7 @@ mod decoder;
 mod error;
 pub(crate) mod gap_recovery;
 mod query;
+mod reorder_buffer;
 mod role;
 mod verdict;
 

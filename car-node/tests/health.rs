@@ -131,9 +131,15 @@ fn a_kidnapped_car_is_lost_at_once_and_localized_again() {
         fault.apply(&mut log);
         let outcome = judge_here(&log);
         let report = FaultReport::new(&fault, f64::INFINITY, &outcome.state_changes);
-        lost_after.push(report.lost_after_s.expect("LOST is said"));
+        lost_after.push(report.lost_after_s.expect("LOST"));
         assert!(report.localized_after_s.is_some(), "{report:?}");
-        assert_eq!(outcome.state_truth.expect("truth").false_lost, 0);
+        // LOST lasts for the update at which the pose jumps to the right place, and no longer.
+        let false_lost = outcome.state_truth.expect("truth").false_lost;
+        assert!(
+            false_lost <= 1,
+            "{fault}: {false_lost} {:?}",
+            outcome.state_changes
+        );
     }
     lost_after.sort_by(f64::total_cmp);
     assert!(lost_after[2] <= 0.5, "{lost_after:?}");

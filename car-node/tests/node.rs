@@ -531,7 +531,7 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
     for (id, name, word) in [
         (1, Some("wet"), "no set"),
         (2, Some("hq"), "in force"),
-        (3, None, "no set"),
+        (3, None, "no shadow set"),
     ] {
         let answer = wall.command(&car, id, None, shadow(name));
         let Outcome::Refused { faults } = answer.outcome else {
@@ -550,7 +550,7 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
     next::<Event>(&events, |event| {
         event.kind == EventKind::ShadowStarted { set: "lq".into() }
     });
-    // A busy machine may drop the shadow, as it should: then it is asked for again.
+    // A busy machine may drop the shadow. Then the test requests it again.
     let comparison = loop {
         let (_, told) = next::<Shadow>(&shadows, |shadow| {
             shadow.who == "load" || shadow.comparison.as_ref().is_some_and(|c| c.scans >= 40)
@@ -580,7 +580,7 @@ fn a_set_in_the_shadow_is_compared_and_ends_when_it_is_put_in_force() {
     let (_, told) = next::<Shadow>(&shadows, |shadow| shadow.set.is_none());
     assert_eq!(told.comparison, None);
     node.shutdown("test over");
-    // The set in force has missed nothing.
+    // The set in force has missed no update.
     let mut last = None;
     while let Ok(Some(sample)) = poses.try_recv() {
         let (_, pose) = decode::<Pose>(&sample.payload().to_bytes()).expect("a pose");

@@ -64,11 +64,7 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
         if bags.from > 0.0 || bags.lasting.is_some() {
             log.keep(bags.from, bags.lasting.unwrap_or(f64::INFINITY));
             if log.span().is_none() {
-                let text = format!(
-                    "{}: --from {}: the bag has no scan after that",
-                    bag.display(),
-                    bags.from
-                );
+                let text = format!("{}: no scan after --from {} s", bag.display(), bags.from);
                 bail!(BadUsage(text));
             }
         }

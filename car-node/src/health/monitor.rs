@@ -57,6 +57,8 @@ pub struct Monitor {
     odometry_jump: Option<(Stamp, f64)>,
     /// The last jump of a pose that was trusted: when, and how far [m].
     pose_jump: Option<(Stamp, f64)>,
+    /// The state is LOST because the localizer gave its pose up, by a jump or a search, and for nothing else.
+    given_up: bool,
     /// The state before STALE.
     before_stale: State,
 }
@@ -86,6 +88,7 @@ impl Monitor {
             ages: PoseAges::default(),
             odometry_jump: None,
             pose_jump: None,
+            given_up: false,
             before_stale: State::Init,
         }
     }
@@ -134,6 +137,8 @@ impl Monitor {
         let pose_jump = self.pose_jump(update);
         if let Some(distance) = pose_jump {
             self.pose_jump = Some((now, distance));
+            // The fit before the jump is that of another pose.
+            self.fit = None;
         }
         // STALE ends first, so that this scan already counts for the state after it.
         let silent = self.silent(now);
@@ -276,8 +281,7 @@ impl Monitor {
             .iter()
             .filter(|since| lasts(**since, t.lost_after))
             .count();
-        let lost = jumped
-            || families >= 2
+        let wrong = families >= 2
             || lasts(self.wrong_since, t.wrong_after)
             || lasts(self.lost_since[Family::EndPoints as usize], t.alone_after);
         let degraded = self.findings.iter().any(|finding| self.lasting(finding));
@@ -288,15 +292,18 @@ impl Monitor {
             (_, Mode::Searching) => State::Relocalizing,
             (_, Mode::Uninitialized) => State::Init,
             (State::Init | State::Relocalizing, Mode::Tracking) => State::Converging,
-            (State::Converging | State::Localized | State::Degraded, _) if lost => State::Lost,
+            (State::Converging | State::Localized | State::Degraded, _) if wrong || jumped => State::Lost,
             (State::Converging, _) if good && self.driven >= t.confirmed_after => State::Localized,
             (State::Localized, _) if degraded => State::Degraded,
             (State::Degraded, _) if good => State::Localized,
             (State::Lost, _) if good => State::Converging,
+            // The pose was wrong before. This one is new, and to be confirmed like any other.
+            (State::Lost, _) if self.given_up && self.good_since.is_some() => State::Converging,
             (state, _) => state,
         };
         if next != self.verdict.state {
             self.enter(next, now);
+            self.given_up = next == State::Lost && (jumped || mode == Mode::Searching) && !wrong;
         }
     }
 
@@ -684,11 +691,18 @@ mod tests {
             "{:?}",
             drive.monitor.verdict().causes
         );
-        assert_eq!(
-            drive.drive(4.0, |_| ()),
-            [State::Lost, State::Converging, State::Localized]
-        );
+        // The pose after the jump is a new one: LOST lasts for one update.
+        assert_eq!(drive.drive(SCAN, |_| ()), [State::Lost, State::Converging]);
+        assert_eq!(drive.drive(4.0, |_| ()), [State::Converging, State::Localized]);
         assert_eq!(drive.monitor.verdict().causes, []);
+
+        // A jump to a place that does not fit is lost for as long as it does not.
+        let mut drive = Drive::localized();
+        drive.drive(SCAN, |update| {
+            leap(update);
+            wrong_pose(update);
+        });
+        assert_eq!(drive.drive(1.0, wrong_pose), [State::Lost]);
 
         // A pose that is not trusted yet may jump. So may any pose after a silence.
         let mut drive = Drive::new();

@@ -4,16 +4,16 @@ use std::collections::VecDeque;
 
 use synpf::Stamp;
 
-/// Outcomes of scans are counted over this long [s].
+/// The CPU is judged over this long [s].
 const WINDOW: f64 = 2.0;
-/// Messages waiting for the filter at a scan, beyond which it is behind: about 0.1 s of a car's sensors.
+/// The filter is behind when more messages than this wait for it: about 0.1 s of a car's sensors.
 const BEHIND: usize = 10;
 /// An update that takes longer than this share of the time between scans is slow.
 const SLOW: f64 = 0.6;
-/// The CPU is short when the filter is behind, slow, or has the shadow leave out scans, at this share of the scans.
+/// There is not enough CPU when the filter is behind or slow, or the shadow skips scans, at this share of the scans.
 const TOO_MANY: f64 = 0.2;
 
-/// What a scan has cost.
+/// The cost of a scan.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ScanCost {
     /// The scan's stamp.
@@ -22,7 +22,7 @@ pub(super) struct ScanCost {
     pub(super) taken: f64,
     /// Messages that waited for the filter.
     pub(super) queued: usize,
-    /// Scans that the shadow has left out before this one.
+    /// Scans that the shadow skipped before this one.
     pub(super) skipped: u64,
 }
 
@@ -31,7 +31,7 @@ pub(super) struct ScanCost {
 pub(super) struct Budget(VecDeque<ScanCost>);
 
 impl Budget {
-    /// Takes in a scan. Some reason when the CPU has been short for all of the window.
+    /// Adds a scan. Returns a reason when there was not enough CPU for the whole window.
     pub(super) fn on_scan(&mut self, spent: &ScanCost) -> Option<String> {
         self.0.push_back(*spent);
         let first = self.0.front()?.stamp;
@@ -50,19 +50,19 @@ impl Budget {
         let percent = |share: f64| share * 100.0;
         if behind > TOO_MANY {
             Some(format!(
-                "the CPU is short: more than {BEHIND} messages waited for the filter at {:.0} % of the scans",
+                "not enough CPU: more than {BEHIND} messages waited for the filter at {:.0} % of the scans",
                 percent(behind)
             ))
         } else if slow > TOO_MANY {
             Some(format!(
-                "the CPU is short: {:.0} % of the updates took longer than {:.0} of the {:.0} ms between scans",
+                "not enough CPU: {:.0} % of the updates took longer than {:.0} of the {:.0} ms between scans",
                 percent(slow),
                 SLOW * period * 1e3,
                 period * 1e3
             ))
         } else if left_out > TOO_MANY {
             Some(format!(
-                "the CPU is short: the shadow had to leave out {:.0} % of the scans",
+                "not enough CPU: the shadow skipped {:.0} % of the scans",
                 percent(left_out)
             ))
         } else {
@@ -110,7 +110,7 @@ mod tests {
             drive(|scan, spent| spent.taken = if scan > 100 { 0.02 } else { 0.002 }),
             drive(|scan, spent| spent.skipped = u64::from(scan > 100)),
         ];
-        for (ended, word) in reasons.iter().zip(["waited", "took longer", "leave out"]) {
+        for (ended, word) in reasons.iter().zip(["waited", "took longer", "skipped"]) {
             let (when, evidence) = ended.as_ref().expect("ends");
             assert!((2.5..4.6).contains(when), "{when} s: {evidence}");
             assert!(evidence.contains(word), "{evidence}");

@@ -313,7 +313,7 @@ impl Subscription<'_> {
             .map(|name| name.trim_matches('/').to_owned());
         std::iter::once(rmw)
             .chain(bridged)
-            .map(|key| self.declare(kind, key))
+            .map(|key| self.declare(kind, &key))
             .collect()
     }
 
@@ -323,16 +323,16 @@ impl Subscription<'_> {
         let rmw = format!("{}/{name}/{}/*", self.domain, kind.dds_type());
         [rmw, name.to_owned()]
             .into_iter()
-            .map(|key| self.declare(kind, key))
+            .map(|key| self.declare(kind, &key))
             .collect()
     }
 
-    fn declare(&self, kind: Kind, key: String) -> Result<AnySubscriber, Ros2Error> {
+    fn declare(&self, kind: Kind, key: &str) -> Result<AnySubscriber, Ros2Error> {
         let failed = |error: zenoh::Error| Ros2Error::Zenoh(format!("cannot subscribe to {key}: {error}"));
         // What this node publishes on the same session is no input.
         let subscriber = self
             .session
-            .declare_subscriber(key.clone())
+            .declare_subscriber(key.to_owned())
             .with(listener(kind, self.domain, self.sender))
             .allowed_origin(Locality::Remote);
         // Static transforms are sent once, before this node subscribes. Their publishers keep them for late subscribers.

@@ -10,7 +10,7 @@ use protocol::{CarName, Pose2, Rates};
 
 use crate::network::endpoint;
 
-/// The pit wall: how well every car is localized and why. Without a command it serves the page.
+/// Shows how well every car is localized, and why. Without a command, serves the page.
 #[derive(Debug, Parser)]
 #[command(version, after_help = EXIT_CODES)]
 pub(crate) struct Cli {
@@ -27,7 +27,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Args)]
 pub(crate) struct Page {
-    /// Where the page is served. On any but a loopback address it asks for the token that is printed.
+    /// Address of the page. If it is not a loopback address, the page requires the token that is printed.
     #[arg(
         long = "page",
         global = true, help_heading = GLOBAL,
@@ -35,43 +35,43 @@ pub(crate) struct Page {
         default_value = "127.0.0.1:7448"
     )]
     pub(crate) address: SocketAddr,
-    /// The folder that recordings started from the page go to.
+    /// Folder for the recordings that are started from the page.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     pub(crate) recordings: PathBuf,
-    /// Write what the Rerun viewer shows into this file too.
+    /// Also write the data for the Rerun viewer into this file.
     #[cfg(feature = "rerun")]
     #[arg(long, value_name = "FILE.rrd")]
     pub(crate) rerun_save: Option<PathBuf>,
-    /// Send it to a Rerun viewer that listens there.
+    /// Also send the data to a running Rerun viewer.
     #[cfg(feature = "rerun")]
     #[arg(long, value_name = "URL", num_args = 0..=1, default_missing_value = "rerun+http://127.0.0.1:9876/proxy")]
     pub(crate) rerun_connect: Option<String>,
 }
 
-/// Over the options that every command takes, apart from its own.
+/// Heading of the options that every command accepts.
 const GLOBAL: &str = "Global options";
 
-const EXIT_CODES: &str = "Without --listen and --connect, a pit wall that already runs on this laptop is joined; where \
-none does, this program listens for the cars itself, on tcp/0.0.0.0:7447, while it runs.
+const EXIT_CODES: &str = "Without --listen and --connect, the program joins the pit wall that runs on this laptop. If none \
+runs, it listens for the cars itself on tcp/0.0.0.0:7447.
 
 Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict,
 7 recovered with losses.";
 
 #[derive(Debug, Args)]
 pub(crate) struct NetworkOptions {
-    /// Listen for cars here, as tcp/ADDRESS:PORT; may be given several times.
+    /// Listen for cars on tcp/ADDRESS:PORT. May be given several times.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) listen: Vec<String>,
-    /// Join a running pit wall or router there.
+    /// Connect to a running pit wall or router.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
-    /// Your name, as the cars and the others at the pit wall see it; $USER unless given.
+    /// Your name, as shown to the others at the pit wall [default: $USER]
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "NAME")]
     operator: Option<String>,
 }
 
 impl NetworkOptions {
-    /// Who gives commands.
+    /// The operator's name, which every command carries.
     pub(crate) fn operator(&self) -> String {
         let user = || std::env::var("USER").ok().filter(|user| !user.is_empty());
         self.operator
@@ -85,46 +85,46 @@ impl NetworkOptions {
 pub(crate) enum Verb {
     /// List the cars: state and cause, set in force, rates, ages, losses.
     Cars {
-        /// How long to listen before the list is written.
+        /// Time to listen before the list is printed.
         #[arg(long, value_name = "TIME", default_value = "2s", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
-    /// Follow the cars on a whole screen, with the switch; as plain lines where stdout is no terminal.
+    /// Show the cars in the terminal and switch their sets. Prints lines if stdout is not a terminal.
     Watch {
-        /// The car to begin with; without a terminal, the only one to be told of.
+        /// The car to select first. Without a terminal, the only car to print.
         car: Option<CarName>,
         /// Stop after this time.
         #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
         time: Option<Duration>,
-        /// Views per second, 0.01 to 100; 10 on a terminal, else 1.
+        /// Updates per second, 0.01 to 100 [default: 10 on a terminal, else 1]
         #[arg(long, value_name = "HZ", allow_negative_numbers = true, value_parser = views)]
         rate: Option<f64>,
-        /// Wait so long for a car that is not there yet.
+        /// Maximum time to wait for the car.
         #[arg(long, value_name = "TIME", default_value = "10m", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
-    /// Look at a car's parameter sets, or change the one in force.
+    /// Show or change a car's parameter sets.
     Params {
         /// The car.
         car: CarName,
         #[command(subcommand)]
         verb: Option<ParamsVerb>,
     },
-    /// Tell a car where it is, or let it search.
+    /// Set a car's pose, or start a global search.
     Locate {
         /// The car.
         car: CarName,
         #[command(flatten)]
         how: Place,
     },
-    /// See or set how often a car sends what.
+    /// Show or set the rates at which a car publishes.
     Rates {
         /// The car.
         car: CarName,
         #[command(flatten)]
         rates: RateOptions,
     },
-    /// Let a car switch sets by itself, or not.
+    /// Switch automatic selection of the parameter set on or off.
     Auto {
         /// The car.
         car: CarName,
@@ -132,42 +132,42 @@ pub(crate) enum Verb {
         #[arg(value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
         on: bool,
     },
-    /// List what happened.
+    /// List the events.
     Events {
         /// Only this car.
         car: Option<CarName>,
-        /// Go on until interrupted.
+        /// Keep printing new events until interrupted.
         #[arg(long, short)]
         follow: bool,
-        /// With --follow: wait so long for a car to appear.
+        /// With --follow: maximum time to wait for the car.
         #[arg(long, value_name = "TIME", default_value = "10m", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
-    /// Record all cars into an MCAP file, until interrupted.
+    /// Record all cars into an MCAP file until interrupted.
     Record {
-        /// The new file; never overwritten.
+        /// The new file. Existing files are never overwritten.
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
         /// Stop after this time.
         #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
         time: Option<Duration>,
     },
-    /// Serve the page from a recording, as if the cars were there.
+    /// Serve the page from a recording.
     Replay {
         /// The recording.
         file: PathBuf,
-        /// Times real time, 0.1 to 50.
+        /// Speed as a multiple of real time, 0.1 to 50.
         #[arg(long, value_name = "FACTOR", default_value = "1", allow_negative_numbers = true, value_parser = speed)]
         speed: f64,
-        /// Begin here, as 90s or 5m.
+        /// Time in the recording to start at, such as 90s or 5m.
         #[arg(long, value_name = "TIME", default_value = "0s", allow_hyphen_values = true, value_parser = duration)]
         at: Duration,
     },
-    /// Tell what a recording says: laps, sectors, alignment, load, true error; with figures as one HTML file.
+    /// Report laps, sectors, alignment, load and true error of a recording, with figures in one HTML file.
     Report {
         /// The recording.
         file: PathBuf,
-        /// The page; FILE.html unless given.
+        /// The HTML file [default: FILE.html]
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
@@ -175,15 +175,15 @@ pub(crate) enum Verb {
     Export {
         /// The recording.
         file: PathBuf,
-        /// The new folder; FILE.csv unless given.
+        /// The new folder [default: FILE.csv]
         #[arg(short, long, value_name = "FOLDER")]
         output: Option<PathBuf>,
     },
-    /// Repair a recording that was cut off or damaged; exit code 7 when something was lost.
+    /// Save what is intact in a damaged recording. The exit code is 7 if something is lost.
     Recover {
-        /// The damaged file; it stays as it is.
+        /// The damaged file. It is not changed.
         file: PathBuf,
-        /// The new file; FILE.recovered.mcap unless given.
+        /// The new file [default: FILE.recovered.mcap]
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
@@ -191,7 +191,7 @@ pub(crate) enum Verb {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ParamsVerb {
-    /// Show the set in force, every value.
+    /// Show the set in force with all its values.
     Get,
     /// List all sets on the car.
     List,
@@ -211,27 +211,27 @@ pub(crate) enum ParamsVerb {
     },
     /// Store a set from a YAML or JSON file on the car, and put it in force.
     Put {
-        /// The file: `parameter: value`, one a line. What it does not name keeps its value.
+        /// File with one `parameter: value` per line. Other parameters keep their values.
         file: PathBuf,
-        /// The set's name; the file's unless given.
+        /// Name of the set [default: the file's name]
         #[arg(long)]
         name: Option<String>,
         #[command(flatten)]
         change: Change,
     },
-    /// Keep the set in force: the car will not fall back by itself.
+    /// Keep the set in force, so that the car does not fall back.
     Confirm {
         #[command(flatten)]
         change: Expect,
     },
-    /// Go back to the set that was in force before.
+    /// Return to the set that was in force before.
     Revert {
         #[command(flatten)]
         change: Expect,
     },
-    /// Run a set beside the one in force, on the same scans, and see how the two compare.
+    /// Run a second set on the same scans and compare the two.
     Shadow {
-        /// Its name, or `off`; without it, the comparison is shown.
+        /// Name of the set, or `off`. Without a name, shows the comparison.
         name: Option<String>,
     },
     /// Delete a set that was put on the car.
@@ -245,7 +245,7 @@ pub(crate) enum ParamsVerb {
 
 #[derive(Debug, Args)]
 pub(crate) struct Change {
-    /// Fall back by itself after this time unless confirmed.
+    /// Fall back after this time unless the change is confirmed.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
     pub(crate) revert_after: Option<Duration>,
     #[command(flatten)]
@@ -254,7 +254,7 @@ pub(crate) struct Change {
 
 #[derive(Debug, Args)]
 pub(crate) struct Expect {
-    /// Only if the set in force has this revision.
+    /// Refuse the change unless the set in force has this revision.
     #[arg(long, value_name = "REVISION", allow_negative_numbers = true, value_parser = revision)]
     pub(crate) expect: Option<u64>,
 }
@@ -262,13 +262,13 @@ pub(crate) struct Expect {
 #[derive(Debug, Args)]
 #[group(required = true)]
 pub(crate) struct Place {
-    /// Where it is: x, y [m] and heading [rad] in the map.
+    /// The pose in the map: x and y in m, heading in rad.
     #[arg(long, value_name = "X,Y,HEADING", value_parser = pose, allow_hyphen_values = true, conflicts_with_all = ["global", "pick"])]
     pub(crate) pose: Option<Pose2>,
-    /// Let it search the whole map and show the candidates.
+    /// Search the whole map and list the candidates.
     #[arg(long)]
     pub(crate) global: bool,
-    /// Take this candidate of the last search.
+    /// Use this candidate of the last search.
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = candidate, conflicts_with = "global")]
     pub(crate) pick: Option<u32>,
 }
@@ -287,7 +287,7 @@ pub(crate) struct RateOptions {
     /// Health messages per second.
     #[arg(long, value_name = "HZ", value_parser = rate, allow_negative_numbers = true)]
     pub(crate) health: Option<f32>,
-    /// Send the full-rate streams for the recorder: on or off.
+    /// Publish the full-rate streams for recordings: on or off.
     #[arg(long, value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
     pub(crate) recorded: Option<bool>,
 }
@@ -299,7 +299,7 @@ fn duration(text: &str) -> Result<Duration, String> {
     let number: f64 = number
         .trim()
         .parse()
-        .map_err(|_| format!("{text:?} is no time; say 30s or 5m"))?;
+        .map_err(|_| format!("{text:?} is not a time; use 30s or 5m"))?;
     let scale = match unit {
         "ms" => 1e-3,
         "" | "s" => 1.0,
@@ -307,13 +307,13 @@ fn duration(text: &str) -> Result<Duration, String> {
         "h" => 3600.0,
         _ => return Err(format!("unknown unit {unit:?}; use ms, s, m or h")),
     };
-    Duration::try_from_secs_f64(number * scale).map_err(|_| "a time is 0 s or more".to_owned())
+    Duration::try_from_secs_f64(number * scale).map_err(|_| "a time must be 0 s or more".to_owned())
 }
 
-/// Views per second.
+/// Updates per second.
 fn views(text: &str) -> Result<f64, String> {
     let views = text.parse().ok().filter(|rate| (0.01..=100.0).contains(rate));
-    views.ok_or_else(|| "wanted is a number from 0.01 to 100".to_owned())
+    views.ok_or_else(|| "the rate must be a number from 0.01 to 100".to_owned())
 }
 
 fn candidate(text: &str) -> Result<u32, String> {
@@ -323,16 +323,20 @@ fn candidate(text: &str) -> Result<u32, String> {
 
 fn revision(text: &str) -> Result<u64, String> {
     text.parse()
-        .map_err(|_| "a revision is a whole number, as `pitwall params CAR` tells it".to_owned())
+        .map_err(|_| "a revision is a whole number; `pitwall params CAR` shows it".to_owned())
 }
 
 fn speed(text: &str) -> Result<f64, String> {
-    let speed: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    let speed: f64 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
     let allowed = Replay::SPEEDS;
     if allowed.contains(&speed) {
         Ok(speed)
     } else {
-        Err(format!("a speed is {} to {}", allowed.start(), allowed.end()))
+        Err(format!(
+            "the speed must be {} to {}",
+            allowed.start(),
+            allowed.end()
+        ))
     }
 }
 
@@ -340,28 +344,32 @@ fn on_off(text: &str) -> Result<bool, String> {
     match text {
         "on" => Ok(true),
         "off" => Ok(false),
-        _ => Err("say on or off".to_owned()),
+        _ => Err("use on or off".to_owned()),
     }
 }
 
 fn rate(text: &str) -> Result<f32, String> {
-    let rate: f32 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    let rate: f32 = text.parse().map_err(|_| format!("{text:?} is not a number"))?;
     if (0.0..=Rates::MAX).contains(&rate) {
         Ok(rate)
     } else {
-        Err(format!("a rate is 0 to {} Hz", Rates::MAX))
+        Err(format!("a rate must be 0 to {} Hz", Rates::MAX))
     }
 }
 
 fn pose(text: &str) -> Result<Pose2, String> {
     let numbers: Vec<f64> = text
         .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("{part:?} is no number")))
+        .map(|part| {
+            part.trim()
+                .parse()
+                .map_err(|_| format!("{part:?} is not a number"))
+        })
         .collect::<Result<_, _>>()?;
     match numbers[..] {
         [x, y, heading] if numbers.iter().all(|n| n.is_finite()) => Ok(Pose2 { x, y, heading }),
         [_, _, _] => Err("all three must be finite".to_owned()),
-        _ => Err("say X,Y,HEADING, as in 1.5,-0.2,3.14".to_owned()),
+        _ => Err("use X,Y,HEADING, such as 1.5,-0.2,3.14".to_owned()),
     }
 }
 
@@ -371,7 +379,7 @@ mod tests {
     use clap::CommandFactory;
 
     #[test]
-    fn the_command_line_makes_sense() {
+    fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
     }
 
@@ -403,8 +411,8 @@ mod tests {
             ("rates car-1 --pose -1", "--pose"),
         ] {
             let error = Cli::try_parse_from(["pitwall"].into_iter().chain(call.split(' ')));
-            let said = error.expect_err(call).to_string();
-            assert!(said.contains(&format!("for '{option} ")), "{call}: {said}");
+            let text = error.expect_err(call).to_string();
+            assert!(text.contains(&format!("for '{option} ")), "{call}: {text}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! What reaches the pit wall: the one stream of events that the fleet, the recorder and a replay share.
+//! The events that reach the pit wall. The fleet, the recorder and a replay share them.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use protocol::{CarInfo, CarName, Header, MapReply, Telemetry, Topic};
 /// Receives every event. It runs in the decoder's thread or in one of zenoh's, so it must not wait.
 pub type EventSink = Arc<dyn Fn(FleetEvent) + Send + Sync>;
 
-/// Something that reached the pit wall.
+/// An event of one car.
 #[derive(Debug, Clone)]
 pub struct FleetEvent {
     /// When it arrived, by the laptop's clock \[unix ns\].
@@ -38,13 +38,13 @@ pub enum EventPayload {
         /// The bytes as received.
         bytes: Arc<[u8]>,
     },
-    /// Bytes that are no message, or a message of an unknown version.
+    /// A message that cannot be decoded, because it is damaged or of an unknown version.
     Unreadable {
-        /// The topic that they came on.
+        /// The topic that it came on.
         topic: Topic,
-        /// Their header, if they begin with one.
+        /// The header, if it can be decoded.
         header: Option<Header>,
-        /// Why they cannot be decoded.
+        /// Why it cannot be decoded.
         error: String,
     },
     /// The car's map was fetched.
@@ -54,13 +54,13 @@ pub enum EventPayload {
         /// The bytes as received.
         bytes: Arc<[u8]>,
     },
-    /// What runs on the car was fetched.
+    /// The software versions on the car were fetched.
     Info(CarInfo),
-    /// Somebody at the pit wall marked this moment.
+    /// An operator marked this moment.
     Marker {
-        /// Who.
+        /// The operator.
         who: Arc<str>,
-        /// The text that they typed.
+        /// The text.
         text: Arc<str>,
     },
     /// The car's clock was compared with the laptop's.
@@ -70,18 +70,18 @@ pub enum EventPayload {
         /// Round-trip time; the offset is exact to within half of it \[ns\].
         round_trip: i64,
     },
-    /// The car has reported where its streams end, because a recording is about to end there.
+    /// The car has answered a final sync: a recording is about to end here.
     StreamEnds {
         /// The car's run.
         run_id: u64,
-        /// When the car reported it, by its own clock \[unix ns\].
+        /// When the car answered, by its own clock \[unix ns\].
         published: i64,
-        /// The streams of which messages are still to come.
+        /// The messages that have not arrived yet.
         outstanding: Vec<SentRange>,
     },
 }
 
-/// Sequence numbers of a stream that were sent and have not been forwarded yet.
+/// Sequence numbers of a stream that were sent and have not been released yet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SentRange {
     /// The stream's topic.
@@ -97,6 +97,6 @@ pub struct SentRange {
 pub enum Delivery {
     /// As soon as it arrived; messages before it may be missing.
     Live,
-    /// In the order of sending and with gaps filled, so possibly late.
+    /// In the order of sending, with gaps filled, and therefore possibly late.
     InOrder,
 }

@@ -279,7 +279,7 @@ mod tests {
         let [first, second] =
             ["first", "second"].map(|name| Recorder::start(&folder.path().join(name)).expect("begun"));
         assert!(bus.attach_recorder(first, 0).is_ok());
-        let rejected = bus.attach_recorder(second, 0).err().expect("given back");
+        let rejected = bus.attach_recorder(second, 0).expect_err("given back");
         assert!(rejected.path().ends_with("second"));
         rejected.finish().expect("ended");
         let first = bus.detach_recorder().expect("the first");

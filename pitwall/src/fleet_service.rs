@@ -1,4 +1,4 @@
-//! The running pit wall: a connection whose events update a fleet and fill a recording on request.
+//! The running pit wall: connects to the cars, and feeds their events to the fleet and to a recording.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -109,7 +109,7 @@ impl FleetService {
         }
         let recorder = Recorder::start(path)?;
         if let Err(rejected) = self.bus.attach_recorder(recorder, unix_now()) {
-            // Another recording has started since the check. The new file holds nothing.
+            // Another recording has started since the check. The new file is empty.
             drop(rejected);
             if let Err(error) = std::fs::remove_file(path) {
                 tracing::warn!(file = %path.display(), %error, "an empty recording is left");
@@ -120,7 +120,7 @@ impl FleetService {
         Ok(())
     }
 
-    /// Ends the recording and returns what is in it; None when nothing was being recorded. A final sync with every car
+    /// Ends the recording and returns its summary; None when nothing was being recorded. A final sync with every car
     /// comes first, so that all of its streams end at the same moment.
     pub async fn stop_recording(&self) -> Option<Result<RecordingSummary, RecordingError>> {
         self.recording_path()?;
@@ -128,7 +128,7 @@ impl FleetService {
         self.cut_recording().await
     }
 
-    /// Ends the recording without a final sync and returns what is in it; None when nothing was being recorded.
+    /// Ends the recording without a final sync and returns its summary; None when nothing was being recorded.
     pub async fn cut_recording(&self) -> Option<Result<RecordingSummary, RecordingError>> {
         // Messages held back behind a gap are recorded first.
         if let Err(error) = self.connection.subscribe_recorded(false).await {

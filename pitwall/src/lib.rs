@@ -1,12 +1,36 @@
-//! The pit wall: how well every car is localized and why, on one laptop.
+//! The pit wall: shows on one laptop how well every car is localized, and why.
 //!
 //! ```text
 //! cars ==zenoh==> network -> FleetEvent -> Fleet (pure state) -> page, terminal, JSON
-//!                                '-------> recording (one MCAP file per session)
+//!                                '-------> recording (one MCAP file with all cars)
 //! ```
 //!
-//! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. [`Connection`] is the
-//! only way to the network.
+//! [`Fleet`] has no clock and no I/O: a replay is the same [`Fleet::apply`] over the same events. Only [`Connection`] uses
+//! the network. The pit wall never localizes a car, and it does not depend on the node that does.
+//!
+//! # Example
+//!
+//! A car appears and then sends nothing for two seconds:
+//!
+//! ```
+//! use pitwall::{EventPayload, Fleet, FleetEvent};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! const SECOND: i64 = 1_000_000_000;
+//! let mut fleet = Fleet::default();
+//! fleet.apply(&FleetEvent {
+//!     at: SECOND,
+//!     car: "car-1".parse()?,
+//!     payload: EventPayload::Appeared,
+//! });
+//! assert_eq!(fleet.view(SECOND)[0].state, "INIT");
+//!
+//! fleet.tick(3 * SECOND);
+//! assert_eq!(fleet.view(3 * SECOND)[0].state, "BLIND");
+//! assert_eq!(fleet.log().alarms(), 1);
+//! # Ok(())
+//! # }
+//! ```
 
 // The commands name the library as any other program would.
 extern crate self as pitwall;

@@ -1,4 +1,4 @@
-//! The program: what `main` does, in the library so that a test can run it as a process of its own.
+//! The program. It is in the library so that a test can run it as a separate process.
 
 use std::io::ErrorKind;
 use std::process::ExitCode;
@@ -8,11 +8,11 @@ use tracing_subscriber::EnvFilter;
 
 use crate::{RecordingError, StartRecordingError, cli, commands, output};
 
-/// Reads the command line and does what it says, until the end or until interrupted.
+/// Reads the command line and runs the command, until it ends or is interrupted.
 pub fn program() -> ExitCode {
     let cli = cli::Cli::parse();
-    // zenoh speaks of every closed connection as an error; what concerns the operator we say ourselves.
-    // On the full screen, lines in between would be in the way.
+    // zenoh logs every closed connection as an error. We report what concerns the operator.
+    // On the full screen, log lines would spoil the view.
     let screen = matches!(cli.verb, Some(cli::Verb::Watch { .. })) && !cli.json && output::on_terminal();
     let usual = if screen {
         "off"
@@ -42,10 +42,10 @@ pub fn program() -> ExitCode {
     })
 }
 
-/// Exit code: the command line asks for what cannot be.
+/// Exit code: the command line is invalid.
 const BAD_USAGE: u8 = 2;
 
-/// True when a file that was named is not there, is there already, or is none of its kind.
+/// True when a named file is missing, exists already, or is of another kind.
 fn bad_usage(error: &anyhow::Error) -> bool {
     let by_system = |kind: ErrorKind| {
         use ErrorKind::{AlreadyExists, IsADirectory, NotADirectory, NotFound, PermissionDenied};

@@ -1,4 +1,4 @@
-//! A recording, played back as if the cars were there: the same events through the same fleet.
+//! Replays a recording: the same events as from live cars, through the same fleet.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -11,41 +11,41 @@ use crate::event_bus::EventBus;
 use crate::fleet::Fleet;
 use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
-/// A recording being played.
+/// A recording that is being played.
 pub struct Replay {
     bus: Arc<EventBus>,
     path: PathBuf,
-    /// When its first and its last event arrived [unix ns].
+    /// When the first and the last event arrived \[unix ns\].
     span: (i64, i64),
     unreadable: Vec<Unreadable>,
     playhead: Mutex<Playhead>,
-    turned: Condvar,
+    changed: Condvar,
 }
 
-/// Where it is and how it moves.
+/// Position and speed of the replay.
 struct Playhead {
     playing: bool,
     speed: f64,
-    /// The moment of the recording that was shown at `since` [unix ns].
+    /// The recording's time at the moment `since` \[unix ns\].
     at: i64,
     since: Instant,
-    /// A jump that has not been made yet [unix ns].
+    /// Target of a jump that is not made yet \[unix ns\].
     jump: Option<i64>,
     stop: bool,
 }
 
-/// How a replay is getting on.
+/// State of a replay.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ReplayView {
     /// The file.
     pub file: String,
-    /// False while it is paused, and at the end.
+    /// False when paused and at the end.
     pub playing: bool,
-    /// Times real time.
+    /// Speed \[times real time\].
     pub speed: f64,
-    /// Since the recording's begin [s].
+    /// Time since the recording's start \[s\].
     pub at_s: f64,
-    /// From its begin to its end [s].
+    /// Length of the recording \[s\].
     pub duration_s: f64,
 }
 
@@ -58,7 +58,7 @@ impl Playhead {
         self.at.saturating_add(ahead as i64).min(end)
     }
 
-    /// Notes where it is, before something changes.
+    /// Stores the current position before the speed changes.
     fn settle(&mut self, end: i64) {
         self.at = self.now(end);
         self.since = Instant::now();
@@ -66,17 +66,16 @@ impl Playhead {
 }
 
 impl Replay {
-    /// Fastest and slowest [times real time].
+    /// Allowed speeds \[times real time\].
     pub const SPEEDS: std::ops::RangeInclusive<f64> = 0.1..=50.0;
 
-    /// Looks through the whole recording, so that what is wrong with it is known before it is shown, and begins to
-    /// play it on a thread of its own.
+    /// Reads the whole recording once, so that its faults are known before it is shown. Then plays it on a thread.
     pub fn start(path: &Path) -> Result<Arc<Self>, RecordingError> {
         let mut span: Option<(i64, i64)> = None;
         let mut unreadable = UnreadableCount::default();
         for event in read_events(path)? {
             let event = event?;
-            unreadable.take(&event);
+            unreadable.add(&event);
             let at = event.at;
             span = Some(span.map_or((at, at), |(from, to)| (from.min(at), to.max(at))));
         }
@@ -94,7 +93,7 @@ impl Replay {
                 jump: None,
                 stop: false,
             }),
-            turned: Condvar::new(),
+            changed: Condvar::new(),
         });
         let player = replay.clone();
         std::thread::Builder::new()
@@ -104,22 +103,22 @@ impl Replay {
         Ok(replay)
     }
 
-    /// Where its events arrive.
+    /// Distributes the events.
     pub fn bus(&self) -> &Arc<EventBus> {
         &self.bus
     }
 
-    /// What is in the recording and cannot be read.
+    /// The messages that cannot be decoded.
     pub fn unreadable(&self) -> &[Unreadable] {
         &self.unreadable
     }
 
-    /// The moment of the recording that is shown [unix ns].
+    /// The recording's time that is shown \[unix ns\].
     pub fn now(&self) -> i64 {
         self.playhead().now(self.span.1)
     }
 
-    /// How it is getting on.
+    /// The state of the replay.
     pub fn view(&self) -> ReplayView {
         let playhead = self.playhead();
         let at = playhead.jump.unwrap_or_else(|| playhead.now(self.span.1));
@@ -132,15 +131,20 @@ impl Replay {
         }
     }
 
-    /// Plays or pauses, changes the speed [times real time], jumps [s since the begin]. Says what is wrong with a
-    /// wish that makes no sense, and then does nothing.
-    pub fn steer(&self, playing: Option<bool>, speed: Option<f64>, at_s: Option<f64>) -> Result<(), String> {
+    /// Plays or pauses, changes the speed \[times real time\], jumps \[s since the start\]. Does nothing and returns the
+    /// reason when a value is out of range.
+    pub fn set_playback(
+        &self,
+        playing: Option<bool>,
+        speed: Option<f64>,
+        at_s: Option<f64>,
+    ) -> Result<(), String> {
         if let Some(speed) = speed.filter(|speed| !Self::SPEEDS.contains(speed)) {
             let (from, to) = (Self::SPEEDS.start(), Self::SPEEDS.end());
             return Err(format!("speed {speed} is not between {from} and {to}"));
         }
         if let Some(at_s) = at_s.filter(|at_s| !at_s.is_finite()) {
-            return Err(format!("{at_s} s is no moment"));
+            return Err(format!("{at_s} s is not a time"));
         }
         let mut playhead = self.playhead();
         playhead.settle(self.span.1);
@@ -148,21 +152,21 @@ impl Replay {
             let at = self.span.0.saturating_add((at_s * 1e9) as i64);
             playhead.jump = Some(at.clamp(self.span.0, self.span.1));
         }
-        // Played on at its end, it begins again.
+        // Play at the end starts from the beginning.
         if playing == Some(true) && at_s.is_none() && playhead.at >= self.span.1 {
             playhead.jump = Some(self.span.0);
         }
         playhead.playing = playing.unwrap_or(playhead.playing);
         playhead.speed = speed.unwrap_or(playhead.speed);
         drop(playhead);
-        self.turned.notify_all();
+        self.changed.notify_all();
         Ok(())
     }
 
-    /// Ends the playing.
+    /// Stops the replay.
     pub fn stop(&self) {
         self.playhead().stop = true;
-        self.turned.notify_all();
+        self.changed.notify_all();
     }
 
     fn playhead(&self) -> MutexGuard<'_, Playhead> {
@@ -171,7 +175,7 @@ impl Replay {
 
     fn play(&self) {
         if let Err(error) = self.play_until_stopped() {
-            tracing::error!(%error, "the replay ends");
+            tracing::error!(%error, "the replay has failed");
         }
     }
 
@@ -199,19 +203,19 @@ impl Replay {
             let playhead = self.playhead();
             if playhead.jump.is_none() && !playhead.stop {
                 // Ten milliseconds of real time: less than from one snapshot to the next.
-                drop(self.turned.wait_timeout(playhead, Duration::from_millis(10)));
+                drop(self.changed.wait_timeout(playhead, Duration::from_millis(10)));
             }
         }
     }
 
-    /// Plays from the begin up to `to` [unix ns] as fast as it goes, out of sight, and shows what comes out.
+    /// Applies all events up to `to` \[unix ns\] to a new fleet and shows that fleet.
     fn jump(&self, to: i64) -> Result<PeekedEvents, RecordingError> {
         const TICK: i64 = 100_000_000;
         let mut events = PeekedEvents::open(&self.path)?;
         let mut fleet = Fleet::default();
         let mut ticked = self.span.0;
         while let Some(event) = events.next_until(to)? {
-            // Time passes as it did, so that a car that was out of sight was so then, too.
+            // Time passes as it did, so that a car is BLIND where it was.
             while ticked + TICK < event.at {
                 ticked += TICK;
                 fleet.tick(ticked);
@@ -224,7 +228,7 @@ impl Replay {
     }
 }
 
-/// The events of a recording, with a look at the next.
+/// The events of a recording, with one event of look-ahead.
 struct PeekedEvents {
     events: Box<dyn Iterator<Item = Result<FleetEvent, RecordingError>> + Send>,
     next: Option<FleetEvent>,
@@ -238,7 +242,7 @@ impl PeekedEvents {
         })
     }
 
-    /// The next event, if it arrived by `until` [unix ns].
+    /// The next event, if it arrived by `until` \[unix ns\].
     fn next_until(&mut self, until: i64) -> Result<Option<FleetEvent>, RecordingError> {
         if self.next.is_none() {
             self.next = self.events.next().transpose()?;

@@ -428,7 +428,7 @@ async fn a_recording_is_replayed_on_the_same_page() {
     let replay = pitwall::Replay::start(&file).expect("a good file");
     // The replay is paused before the page opens.
     replay
-        .steer(Some(false), Some(2.0), Some(0.5))
+        .set_playback(Some(false), Some(2.0), Some(0.5))
         .expect("valid settings");
     let options = PageOptions {
         address: ([127, 0, 0, 1], 0).into(),

@@ -201,7 +201,7 @@ async fn each_outcome_has_its_exit_code_and_text() {
         (
             &["watch", "ghost", "--wait", "4s"],
             4,
-            &["ghost is not there yet", "no such car: ghost"],
+            &["waiting for ghost", "no such car: ghost"],
         ),
         (&["watch", "car-1", "--for", "2s"], 0, &["car-1"]),
     ];

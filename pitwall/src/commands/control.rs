@@ -1,4 +1,4 @@
-//! `pitwall locate`, `pitwall rates` and `pitwall auto`, and how any command's outcome is told.
+//! `pitwall locate`, `pitwall rates` and `pitwall auto`, and the output of any command's outcome.
 
 use std::process::ExitCode;
 
@@ -20,7 +20,7 @@ pub(super) async fn locate(
         (None, Some(candidate)) => Action::Relocalize(RelocalizeAction::Pick { candidate }),
         (None, None) => Action::Relocalize(RelocalizeAction::Search),
     };
-    give(network, car, action, None, json).await
+    send_command(network, car, action, None, json).await
 }
 
 pub(super) async fn auto(
@@ -29,7 +29,7 @@ pub(super) async fn auto(
     on: bool,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
-    give(network, car, Action::Auto(on), None, json).await
+    send_command(network, car, Action::Auto(on), None, json).await
 }
 
 pub(super) async fn rates(
@@ -76,11 +76,11 @@ pub(super) async fn rates(
         }
         _ => verdict,
     };
-    tell(&service, car, &verdict, json).await
+    report(&service, car, &verdict, json).await
 }
 
-/// Gives a command and tells what became of it.
-pub(super) async fn give(
+/// Sends a command and reports its outcome.
+pub(super) async fn send_command(
     network: &NetworkOptions,
     car: &CarName,
     action: Action,
@@ -95,11 +95,11 @@ pub(super) async fn give(
         .client()
         .command(car, &network.operator(), expect, action)
         .await?;
-    tell(&service, car, &verdict, json).await
+    report(&service, car, &verdict, json).await
 }
 
-/// Tells what became of a command; its exit code does too.
-pub(super) async fn tell(
+/// Prints the outcome of a command; returns its exit code.
+pub(super) async fn report(
     service: &FleetService,
     car: &CarName,
     verdict: &Verdict,
@@ -137,7 +137,7 @@ pub(super) async fn tell(
     Ok(ExitCode::from(verdict.exit_code()))
 }
 
-/// What a command that was done has brought.
+/// The reply of a command that was executed.
 pub(super) fn reply(verdict: &Verdict) -> Option<&Reply> {
     match verdict {
         Verdict::Answered { answer, .. } => match &answer.outcome {

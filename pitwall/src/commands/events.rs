@@ -40,7 +40,7 @@ pub(super) async fn run(
         }
         Ok(last)
     };
-    // What the cars have kept comes in within a second of their being found.
+    // Past events arrive within a second after a car is found.
     super::time_or_interrupt(Some(Duration::from_secs(2))).await;
     let mut seen = write_since(0)?;
     if follow {

@@ -15,7 +15,7 @@ use crate::output;
 
 pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
     let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
-    // Read before anything is written: a faulty recording leaves nothing behind.
+    // Read completely before anything is written, so that a damaged recording leaves no files.
     let events = read_events(file)?.collect::<Result<Vec<_>, _>>()?;
     if events.is_empty() {
         return Err(RecordingError::Empty(file.display().to_string()).into());
@@ -43,7 +43,7 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     let mut counts = [0_u64; 3];
     for event in &events {
         fleet.apply(event);
-        unreadable.take(event);
+        unreadable.add(event);
         let EventPayload::Message {
             topic,
             header,
@@ -114,7 +114,7 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
     Ok(ExitCode::SUCCESS)
 }
 
-/// One line a lap; returns how many.
+/// Writes one line per lap; returns the number of laps.
 fn write_laps(laps: &mut impl Write, fleet: &Fleet) -> std::io::Result<u64> {
     let mut lap_count = 0;
     for car in fleet.cars() {

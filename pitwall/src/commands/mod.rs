@@ -1,4 +1,4 @@
-//! The verbs.
+//! The commands.
 
 mod cars;
 mod control;
@@ -21,18 +21,18 @@ use protocol::CarName;
 use crate::cli::{Cli, NetworkOptions, Verb};
 use crate::output;
 
-/// How long a car may take to be found: those that dial a pit wall that was just opened try again every second.
+/// Time to find a car. Cars try to connect every second.
 const FIND: Duration = Duration::from_secs(3);
 
 /// Exit code: no car of that name.
 const NO_SUCH_CAR: u8 = 4;
 
-/// What was asked for cannot be: the program ends with exit code 2.
+/// The arguments are invalid: the program exits with code 2.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct BadUsage(String);
 
-/// Does what the command line says.
+/// Runs the command.
 pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     let Cli {
         network,
@@ -82,8 +82,8 @@ async fn open(options: &NetworkOptions) -> anyhow::Result<Arc<FleetService>> {
     Ok(FleetService::open(&role).await?)
 }
 
-/// Waits for a car, and says so where that takes longer than usual: the laptop is often started first. False when it is not
-/// there within `patience`, or when the program is asked to stop.
+/// Waits for a car, and prints a note when that takes long, because the laptop is often started first. False when the car is
+/// not connected within `patience`, or at an interrupt.
 async fn await_car(service: &FleetService, car: &CarName, patience: Duration) -> bool {
     let usual = FIND.min(patience);
     if service.wait_for(car, usual).await {
@@ -94,13 +94,13 @@ async fn await_car(service: &FleetService, car: &CarName, patience: Duration) ->
         return false;
     }
     output::print_note(&format!(
-        "{car} is not there yet: waiting for it, {} s at most; Ctrl-C ends it",
+        "waiting for {car}, {} s at most; Ctrl-C stops",
         longer.as_secs_f64().ceil()
     ));
     tokio::select! {
         found = service.wait_for(car, longer) => {
             if found {
-                output::print_note(&format!("{car} is there"));
+                output::print_note(&format!("{car} is connected"));
             }
             found
         }
@@ -108,27 +108,27 @@ async fn await_car(service: &FleetService, car: &CarName, patience: Duration) ->
     }
 }
 
-/// Says that a car is not there.
+/// Prints that a car is not connected.
 async fn no_such_car(service: &FleetService, car: &CarName) -> ExitCode {
     let others: Vec<_> = service.fleet().cars().map(|car| car.name.to_string()).collect();
     let others = if others.is_empty() {
-        "no car is on this link".to_owned()
+        "no car is connected".to_owned()
     } else {
-        format!("there are {}", others.join(", "))
+        format!("connected: {}", others.join(", "))
     };
     output::print_error(&format!("no such car: {car}; {others}"));
     service.close().await;
     ExitCode::from(NO_SUCH_CAR)
 }
 
-/// Says what of a recording cannot be read.
+/// Prints which messages of a recording cannot be decoded.
 fn print_unreadable(unreadable: &[Unreadable]) {
     for stream in unreadable {
         output::print_error(&stream.to_string());
     }
 }
 
-/// Ends when the program is asked to stop.
+/// Waits for an interrupt.
 async fn interrupted() {
     use tokio::signal::unix::{SignalKind, signal};
     let Ok(mut terminate) = signal(SignalKind::terminate()) else {
@@ -140,7 +140,7 @@ async fn interrupted() {
     }
 }
 
-/// Ends after `time`, or when the program is asked to stop.
+/// Waits for `time` or for an interrupt.
 async fn time_or_interrupt(time: Option<Duration>) {
     match time {
         Some(time) => drop(tokio::time::timeout(time, interrupted()).await),

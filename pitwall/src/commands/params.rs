@@ -11,12 +11,12 @@ use protocol::{
 };
 use serde::Deserialize;
 
-use super::control::{give, reply, tell};
+use super::control::{reply, report, send_command};
 use super::{BadUsage, FIND, no_such_car, open};
 use crate::cli::{NetworkOptions, ParamsVerb};
 use crate::output;
 
-/// Exit code: the car does not do that.
+/// Exit code: the car refused.
 const REFUSED: u8 = 3;
 
 /// Exit code: no answer in time.
@@ -41,7 +41,7 @@ pub(super) async fn run(
             let name = name.filter(|name| name != "off");
             let begun = name.clone();
             let action = Action::Params(ParamsAction::Shadow { name });
-            let code = give(network, car, action, None, json).await?;
+            let code = send_command(network, car, action, None, json).await?;
             if let Some(name) = begun.filter(|_| code == ExitCode::SUCCESS && !json) {
                 output::print(&format!(
                     "{name} runs in its shadow; `pitwall params {car} shadow` compares the two"
@@ -68,12 +68,12 @@ pub(super) async fn run(
         Some(ParamsVerb::Revert { change }) => (ParamsAction::Revert, change),
         Some(ParamsVerb::Delete { name, change }) => (ParamsAction::Delete { name }, change),
     };
-    give(network, car, Action::Params(action), expect.expect, json).await
+    send_command(network, car, Action::Params(action), expect.expect, json).await
 }
 
-/// The set in force, as the car last said it.
+/// The set in force, from the last message of the car.
 async fn get(network: &NetworkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
-    let params = match last_said(network, car, "which set is in force", |car| car.params.clone()).await? {
+    let params = match last_value(network, car, "which set is in force", |car| car.params.clone()).await? {
         Ok(params) => params,
         Err(code) => return Ok(code),
     };
@@ -85,8 +85,8 @@ async fn get(network: &NetworkOptions, car: &CarName, json: bool) -> anyhow::Res
     Ok(ExitCode::SUCCESS)
 }
 
-/// What a car last said of something, once it has; else the exit code, when why has been told.
-async fn last_said<T>(
+/// Waits for a value from a car and returns it. Without one, prints why and returns the exit code.
+async fn last_value<T>(
     network: &NetworkOptions,
     car: &CarName,
     of: &str,
@@ -98,11 +98,11 @@ async fn last_said<T>(
     }
     let find = |fleet: &Fleet| fleet.car(car).and_then(&find);
     service.wait_until(FIND, |fleet| find(fleet).is_some()).await;
-    let said = find(&service.fleet());
+    let value = find(&service.fleet());
     service.close().await;
-    Ok(said.ok_or_else(|| {
+    Ok(value.ok_or_else(|| {
         output::print_error(&format!(
-            "{car}: NO ANSWER: it has not said {of}. Is its node older than this program?"
+            "{car}: NO ANSWER: it has not published {of}. Is its node older than this program?"
         ));
         ExitCode::from(NO_ANSWER)
     }))
@@ -134,10 +134,10 @@ fn values(set: &ParameterSet) -> Vec<String> {
     set.values.iter().map(line).collect()
 }
 
-/// How the set in the shadow compares, as the car last said it.
+/// Compares the shadow set with the set in force.
 async fn shadow(network: &NetworkOptions, car: &CarName, json: bool) -> anyhow::Result<ExitCode> {
     let of = "whether a set runs in the shadow";
-    let shadow = match last_said(network, car, of, |car| car.shadow.clone()).await? {
+    let shadow = match last_value(network, car, of, |car| car.shadow.clone()).await? {
         Ok(shadow) => shadow,
         Err(code) => return Ok(code),
     };
@@ -206,7 +206,7 @@ fn compare(car: &CarName, shadow: &Shadow) -> String {
     .join("\n")
 }
 
-/// All sets, or how two of them differ.
+/// Lists all sets, or the differences of two.
 async fn list(
     network: &NetworkOptions,
     car: &CarName,
@@ -223,7 +223,7 @@ async fn list(
         .command(car, &network.operator(), None, action)
         .await?;
     let Some(Reply::Sets(sets)) = reply(&verdict) else {
-        return tell(&service, car, &verdict, json).await;
+        return report(&service, car, &verdict, json).await;
     };
     service.close().await;
     let Some((a, b)) = diff else {
@@ -282,7 +282,7 @@ fn differences(a: &ParameterSet, b: &ParameterSet) -> BTreeMap<String, [Option<V
     all
 }
 
-/// A value as people write it.
+/// A value as text.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Scalar {
@@ -298,7 +298,7 @@ fn read_set(file: &Path, name: Option<String>) -> Result<ParameterSet, BadUsage>
     let text = std::fs::read_to_string(file).map_err(|error| fault(&error))?;
     let name = name
         .or_else(|| Some(file.file_stem()?.to_str()?.to_owned()))
-        .ok_or_else(|| fault(&"give the set a --name"))?;
+        .ok_or_else(|| fault(&"send_command the set a --name"))?;
     let scalars: BTreeMap<String, Scalar> = serde_saphyr::from_str(&text).map_err(|error| fault(&error))?;
     if scalars.is_empty() {
         return Err(fault(
@@ -350,7 +350,7 @@ mod tests {
     fn a_bad_file_is_named() {
         let folder = tempfile::tempdir().expect("a folder");
         let file = folder.path().join("wet.yaml");
-        for (text, told) in [
+        for (text, expected) in [
             ("sigma_hit: 0.1\nz_hit: [1, 2]\n", "line 2"),
             ("sigma_hit: 0.1\nz_hit:\n", "line 2"),
             ("sigma_hit: [\n", "line 1"),
@@ -358,7 +358,7 @@ mod tests {
         ] {
             std::fs::write(&file, text).expect("written");
             let error = read_set(&file, None).expect_err(text).to_string();
-            assert!(error.contains("wet.yaml") && error.contains(told), "{error}");
+            assert!(error.contains("wet.yaml") && error.contains(expected), "{error}");
         }
     }
 

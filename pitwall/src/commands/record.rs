@@ -14,8 +14,8 @@ use crate::output;
 /// Exit code: something in the file could not be saved.
 const DATA_LOST: u8 = 7;
 
-/// A recording that takes longer to end says why.
-const UNREMARKED: Duration = Duration::from_millis(600);
+/// A recording that takes longer than this to end prints why.
+const QUIET: Duration = Duration::from_millis(600);
 
 pub(super) async fn record(
     network: &NetworkOptions,
@@ -28,16 +28,16 @@ pub(super) async fn record(
     let waiting = service.wait_until(FIND, |fleet| fleet.cars().any(|car| car.alive));
     tokio::select! {
         found = waiting => if !found {
-            output::print_note("no car is on this link yet; whatever comes is recorded");
+            output::print_note("no car is connected yet; every car that connects is recorded");
         },
         () = super::interrupted() => {}
     }
     output::print_note(&format!(
-        "recording all cars into {}; Ctrl-C ends it",
+        "recording all cars into {}; Ctrl-C stops it",
         file.display()
     ));
     time_or_interrupt(time).await;
-    let summary = end(&service).await.context("the recorder is gone")??;
+    let summary = end(&service).await.context("the recorder has stopped")??;
     service.close().await;
     if json {
         output::print_json(&summary)?;
@@ -45,17 +45,17 @@ pub(super) async fn record(
         output::print(&summary.to_string());
     }
     if summary.streams.is_empty() {
-        output::print_error(&format!("no car was heard: {} is empty", file.display()));
+        output::print_error(&format!("no car has sent anything: {} is empty", file.display()));
         return Ok(ExitCode::from(NO_SUCH_CAR));
     }
     Ok(ExitCode::SUCCESS)
 }
 
-/// Ends the recording when all that the cars have sent is in it, or at once when the program is asked to stop once more.
+/// Ends the recording after a final sync, or at once at a second interrupt.
 async fn end(service: &FleetService) -> Option<Result<RecordingSummary, RecordingError>> {
     let patience = async {
-        tokio::time::sleep(UNREMARKED).await;
-        output::print_note("waiting for what the cars have sent and has not come; Ctrl-C ends it as it is");
+        tokio::time::sleep(QUIET).await;
+        output::print_note("waiting for messages that are still missing; Ctrl-C stops at once");
         super::interrupted().await;
     };
     tokio::select! {
@@ -99,7 +99,7 @@ fn describe(recovered: &Recovered, to: &Path) -> String {
     lines.push(match (recovered.has_losses(), recovered.complete) {
         (true, _) => format!("DATA WAS LOST{count}"),
         (false, true) => "nothing was lost".to_owned(),
-        (false, false) => "the recording was not ended; everything written to the file was saved".to_owned(),
+        (false, false) => "the recording was not completed; everything in the file was saved".to_owned(),
     });
     lines.join("\n")
 }

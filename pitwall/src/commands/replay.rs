@@ -17,10 +17,10 @@ pub(super) async fn run(
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let path = file.to_owned();
-    // Looking through a long recording takes a while.
+    // Reading a long recording takes a while.
     let replay = tokio::task::spawn_blocking(move || Replay::start(&path)).await??;
     replay
-        .steer(None, Some(speed), (at_s != 0.0).then_some(at_s))
+        .set_playback(None, Some(speed), (at_s != 0.0).then_some(at_s))
         .map_err(|fault| anyhow::anyhow!("{fault}"))?;
     let address = options.address;
     let page = Page::serve_replay(replay.clone(), options)
@@ -33,7 +33,7 @@ pub(super) async fn run(
         output::print_json(&json!({"page": page.url(), "duration_s": duration, "unreadable": unreadable}))?;
     } else {
         output::print(&format!(
-            "replay of {}, {duration:.1} s: {}\nCtrl-C ends it",
+            "replay of {}, {duration:.1} s: {}\nCtrl-C stops it",
             file.display(),
             page.url()
         ));

@@ -22,7 +22,7 @@ pub(super) async fn run(network: &NetworkOptions, page: Page, json: bool) -> any
     if json {
         output::print_json(&json!({"page": server.url(), "link": how}))?;
     } else {
-        output::print(&format!("pit wall: {}\n{how}; Ctrl-C ends it", server.url()));
+        output::print(&format!("pit wall: {}\n{how}; Ctrl-C stops it", server.url()));
     }
     interrupted().await;
     #[cfg(feature = "rerun")]
@@ -31,7 +31,7 @@ pub(super) async fn run(network: &NetworkOptions, page: Page, json: bool) -> any
     Ok(ExitCode::SUCCESS)
 }
 
-/// The views for Rerun that were asked for.
+/// The Rerun outputs of the command line.
 #[cfg(feature = "rerun")]
 fn rerun_views(server: &PitWallServer, page: &Page) -> anyhow::Result<Vec<pitwall::RerunView>> {
     use pitwall::{RerunOutlet, RerunView};

@@ -1,4 +1,4 @@
-//! `pitwall watch`: the cars on a whole terminal screen, or as plain lines or JSON where nobody looks.
+//! `pitwall watch`: the cars on the full terminal screen, or as lines or JSON.
 
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -45,7 +45,7 @@ pub(super) async fn run(
     Ok(ExitCode::SUCCESS)
 }
 
-/// One car, or all where none is named, again and again.
+/// Prints one car, or all if none is named, periodically.
 async fn lines(
     service: &Arc<FleetService>,
     car: Option<&CarName>,
@@ -54,7 +54,7 @@ async fn lines(
 ) -> anyhow::Result<()> {
     let mut ticks = tokio::time::interval(period);
     let mut seen = 0;
-    // The first view waits for the car to have said something.
+    // The first output waits for data from a car.
     service
         .wait_until(FIND, |fleet| {
             let mut cars = fleet.cars().filter(|c| car.is_none_or(|car| *car == c.name));

@@ -1,4 +1,4 @@
-//! What a car's health was over the last minutes, and what it was last time at each place of the track.
+//! A car's health over the last minutes, and at each place of the track when the car was last there.
 
 use std::collections::VecDeque;
 
@@ -9,10 +9,10 @@ use serde::Serialize;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct HealthHistory(VecDeque<HealthSample>);
 
-/// A car's health at one moment.
+/// A car's health at one sample.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct HealthSample {
-    /// When it arrived, by the laptop's clock [unix ns].
+    /// When it arrived, by the laptop's clock \[unix ns\].
     pub at: i64,
     /// The state.
     pub state: State,
@@ -20,9 +20,9 @@ pub struct HealthSample {
     pub alignment: f32,
     /// Slip.
     pub slip: f32,
-    /// Standard deviation along the track [m].
+    /// Standard deviation along the track \[m\].
     pub spread_along: f32,
-    /// Standard deviation across the track [m].
+    /// Standard deviation across the track \[m\].
     pub spread_across: f32,
 }
 
@@ -41,20 +41,20 @@ impl HealthSample {
 }
 
 impl HealthHistory {
-    /// From one moment to the next [ns].
+    /// Sample period \[ns\].
     const EVERY: i64 = 500_000_000;
-    /// Moments kept.
+    /// Maximum number of samples.
     const MAX: usize = 240;
 
-    pub(crate) fn take(&mut self, at: i64, health: &Health) {
+    pub(crate) fn add(&mut self, at: i64, health: &Health) {
         if self.0.back().is_some_and(|last| at - last.at < Self::EVERY) {
             return;
         }
-        if let Some(moment) = HealthSample::new(at, health) {
+        if let Some(sample) = HealthSample::new(at, health) {
             if self.0.len() == Self::MAX {
                 self.0.pop_front();
             }
-            self.0.push_back(moment);
+            self.0.push_back(sample);
         }
     }
 
@@ -71,7 +71,7 @@ pub(crate) struct HealthProfile {
     last: Option<usize>,
 }
 
-/// What was measured at a place.
+/// Health at one place.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ProfileCell {
     /// The state.
@@ -83,11 +83,11 @@ pub struct ProfileCell {
 }
 
 impl HealthProfile {
-    /// Places of a lap, of equal length.
+    /// Number of places of a lap, of equal length.
     const PLACES: usize = 120;
 
-    /// Takes in the health of a car that is at `s` of `length` [m].
-    pub(crate) fn take(&mut self, s: f64, length: f64, health: &Health) {
+    /// Adds the health of a car at arc length `s` of `length` \[m\].
+    pub(crate) fn add(&mut self, s: f64, length: f64, health: &Health) {
         let Some(metrics) = health.metrics else {
             return;
         };
@@ -102,7 +102,7 @@ impl HealthProfile {
             alignment: metrics.alignment,
             slip: metrics.slip,
         };
-        // Places driven over since the last message get this one too; further apart it was a jump.
+        // Places passed since the last message get the same health, unless the car jumped.
         let driven = self
             .last
             .map_or(0, |last| (here + Self::PLACES - last) % Self::PLACES);
@@ -117,7 +117,7 @@ impl HealthProfile {
         self.last = Some(here);
     }
 
-    /// From the start line onwards; empty before the first.
+    /// From the start line on; empty before the first sample.
     pub(crate) fn cells(&self) -> &[Option<ProfileCell>] {
         &self.cells
     }
@@ -147,7 +147,7 @@ mod tests {
     fn two_minutes_are_kept() {
         let mut history = HealthHistory::default();
         for i in 0..3000 {
-            history.take(i * 100_000_000, &health(0.9));
+            history.add(i * 100_000_000, &health(0.9));
         }
         let samples: Vec<_> = history.samples().collect();
         assert_eq!(samples.len(), HealthHistory::MAX);
@@ -159,30 +159,30 @@ mod tests {
     }
 
     #[test]
-    fn what_was_driven_over_is_painted_and_nothing_else() {
+    fn the_places_that_were_passed_have_a_health_and_no_others() {
         let mut health_profile = HealthProfile::default();
         let length = 60.0;
         // Two cells a message, over the start line.
         for s in [58.0, 59.0, 0.0, 1.0] {
-            health_profile.take(s, length, &health(0.5));
+            health_profile.add(s, length, &health(0.5));
         }
-        let painted: Vec<usize> = (0..HealthProfile::PLACES)
+        let filled: Vec<usize> = (0..HealthProfile::PLACES)
             .filter(|&i| health_profile.cells()[i].is_some())
             .collect();
-        assert_eq!(painted, [0, 1, 2, 116, 117, 118, 119]);
-        health_profile.take(30.0, length, &health(0.7));
+        assert_eq!(filled, [0, 1, 2, 116, 117, 118, 119]);
+        health_profile.add(30.0, length, &health(0.7));
         assert_eq!(
             health_profile.cells().iter().flatten().count(),
             8,
-            "a jump paints only where it ends"
+            "a jump fills only its end"
         );
         for s in [f64::NAN, -1.0, 61.0] {
-            health_profile.take(s, length, &health(0.1));
+            health_profile.add(s, length, &health(0.1));
         }
         assert_eq!(
             health_profile.cells().iter().flatten().count(),
             8,
-            "off the line paints nothing"
+            "outside the lap nothing is filled"
         );
     }
 }

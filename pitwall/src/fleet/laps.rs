@@ -1,7 +1,7 @@
-//! Laps with their sectors, and what each was like.
+//! Laps with their sectors, grip and distance from the raceline.
 //!
-//! A car tells when a lap ended and how long it took. Where the lap's time went, the pit wall reads off the poses:
-//! the samples at which `s` passes each third of the raceline, between two poses by the straight line.
+//! A car reports when a lap has ended and its time. The sector times come from the poses: the moments at which `s` passes
+//! each third of the raceline, interpolated linearly between two poses.
 
 use std::collections::VecDeque;
 
@@ -11,36 +11,36 @@ use serde::Serialize;
 /// Sectors of a lap, of equal length along the raceline.
 pub const SECTORS: usize = 3;
 
-/// A lap that was driven.
+/// A completed lap.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Lap {
     /// Its number, from 1.
     pub lap: u32,
-    /// Its time [s].
+    /// Its time \[s\].
     pub time_s: f64,
     /// The set in force at its end.
     pub set: String,
-    /// Times of its sectors [s]; None where poses are missing.
+    /// Sector times \[s\]; None if poses are missing.
     pub sectors_s: [Option<f64>; SECTORS],
-    /// What it was like; None when no health message came during it.
+    /// Grip and alignment; None without health messages during the lap.
     pub grip: Option<LapGrip>,
-    /// Mean distance from the raceline, by the car's own estimate [m]; None without poses.
+    /// Mean distance from the raceline, by the car's own estimate \[m\]; None without poses.
     pub lateral_m: Option<f64>,
 }
 
-/// How the wheels gripped during a lap, and how well scans fitted.
+/// Grip of the wheels and fit of the scans during a lap.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LapGrip {
-    /// Share of the lap in which wheels slipped by more than [`LapGrip::SLIPS`], in `[0, 1]`.
+    /// Share of the lap with a slip of more than [`LapGrip::SLIPS`], in `[0, 1]`.
     pub slipping: f64,
-    /// The worst slip, without its sign.
+    /// Maximum absolute slip.
     pub worst_slip: f64,
     /// Mean alignment, in `[0, 1]`.
     pub alignment: f64,
 }
 
 impl LapGrip {
-    /// From here on wheels slip: the health monitor's limit for a warning.
+    /// Slip above which the wheels slip: the warning limit of the health monitor.
     pub const SLIPS: f32 = 0.08;
 }
 
@@ -48,7 +48,7 @@ impl LapGrip {
 #[derive(Debug, Clone, Default)]
 pub(crate) struct LapTimer {
     laps: Vec<Lap>,
-    /// Laps under way or just ended, the newest last.
+    /// Laps that have not ended yet or just have, the newest last.
     traces: VecDeque<Trace>,
     last: Option<TrackPose>,
 }
@@ -56,23 +56,23 @@ pub(crate) struct LapTimer {
 /// A pose on the raceline.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct TrackPose {
-    /// When it was true [unix ns].
+    /// When it was true \[unix ns\].
     pub(crate) at: i64,
-    /// Along the raceline [m].
+    /// Arc length on the raceline \[m\].
     pub(crate) s: f64,
-    /// Off the raceline [m].
+    /// Distance from the raceline \[m\].
     pub(crate) d: f64,
     /// Laps begun.
     pub(crate) lap: u32,
 }
 
-/// What is known of a lap before it has ended.
+/// Data of a lap that has not ended.
 #[derive(Debug, Clone, Default)]
 struct Trace {
     lap: u32,
-    /// When it began [unix ns]; None when that was not seen.
+    /// When it started \[unix ns\]; None if the start was missed.
     begun: Option<i64>,
-    /// When each border between two sectors was passed [unix ns].
+    /// When each border between two sectors was passed \[unix ns\].
     borders: [Option<i64>; SECTORS - 1],
     poses: u32,
     lateral: f64,
@@ -83,21 +83,21 @@ struct Trace {
 }
 
 impl LapTimer {
-    /// Most laps kept.
+    /// Maximum number of laps kept.
     const MAX_LAPS: usize = 500;
-    /// Laps that may wait for their end to be told.
+    /// Maximum number of laps whose end is not reported yet.
     const MAX_TRACES: usize = 4;
-    /// A step from one pose to the next that takes longer is a gap [ns].
+    /// A longer time between two poses is a gap \[ns\].
     const GAP: i64 = 1_000_000_000;
 
     pub(crate) fn laps(&self) -> &[Lap] {
         &self.laps
     }
 
-    /// Takes in a pose on a raceline of `length` [m].
+    /// Adds a pose on a raceline of `length` \[m\].
     pub(crate) fn on_pose(&mut self, here: TrackPose, length: f64) {
         let before = self.last.replace(here);
-        // A car that starts again counts its laps from the beginning.
+        // A car that restarts counts its laps from the beginning.
         if self.traces.back().is_some_and(|trace| trace.lap > here.lap) {
             self.traces.clear();
         }
@@ -141,16 +141,16 @@ impl LapTimer {
         }
     }
 
-    /// Takes in that a lap has ended.
+    /// Adds a completed lap.
     pub(crate) fn on_lap(&mut self, lap: u32, time_s: f64, set: &str) {
         let at = self.traces.iter().position(|trace| trace.lap == lap);
         let trace = at.map(|at| &self.traces[at]);
-        // The news may be faster than the first pose of the next lap.
+        // The event may arrive before the first pose of the next lap.
         let next = at.and_then(|at| self.traces.get(at + 1));
-        let told = |begun: i64| begun + (time_s * 1e9) as i64;
+        let end_time = |begun: i64| begun + (time_s * 1e9) as i64;
         let end = next
             .and_then(|next| next.begun)
-            .or_else(|| trace.and_then(|trace| trace.begun).map(told));
+            .or_else(|| trace.and_then(|trace| trace.begun).map(end_time));
         let mut sectors_s = [None; SECTORS];
         if let Some(trace) = trace {
             let marks: Vec<Option<i64>> = std::iter::once(trace.begun)
@@ -216,7 +216,7 @@ impl Step {
         })
     }
 
-    /// When `s` was passed [unix ns]; None if it was not.
+    /// When `s` was passed \[unix ns\]; None if it was not.
     fn when(&self, s: f64) -> Option<i64> {
         let (from, to) = (self.from, self.to);
         (from.1 < s && s <= to.1)
@@ -231,10 +231,10 @@ mod tests {
     const LENGTH: f64 = 30.0;
 
     /// Drives at 40 poses a second: 5 m/s in the first sector, 10 in the second, 2.5 in the third.
-    fn drive(book: &mut LapTimer, laps: u32) {
+    fn drive(timer: &mut LapTimer, laps: u32) {
         let (mut s, mut at, mut lap) = (29.0, 0, 0);
         while lap < laps + 1 {
-            book.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
+            timer.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
             let speed = [5.0, 10.0, 2.5][(s / 10.0) as usize % SECTORS];
             s += speed / 40.0;
             at += 25_000_000;
@@ -243,15 +243,15 @@ mod tests {
                 lap += 1;
             }
         }
-        book.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
+        timer.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
     }
 
     #[test]
     fn sectors_add_up_to_the_lap() {
-        let mut book = LapTimer::default();
-        drive(&mut book, 2);
-        book.on_lap(2, 7.0, "hq");
-        let lap = &book.laps()[0];
+        let mut timer = LapTimer::default();
+        drive(&mut timer, 2);
+        timer.on_lap(2, 7.0, "hq");
+        let lap = &timer.laps()[0];
         let sectors: Vec<f64> = lap.sectors_s.iter().map(|s| s.expect("driven")).collect();
         // Speeds change with the pose after a border: half a step, or 12.5 ms, to either side.
         for (sector, expected) in sectors.iter().zip([2.0, 1.0, 4.0]) {
@@ -264,12 +264,12 @@ mod tests {
 
     #[test]
     fn a_lap_whose_news_comes_first_has_its_last_sector() {
-        let mut book = LapTimer::default();
-        drive(&mut book, 1);
-        let begun_two = book.traces.back().expect("a lap").lap;
-        book.traces.pop_back();
-        book.on_lap(begun_two - 1, 7.0, "hq");
-        assert!(book.laps()[0].sectors_s.iter().all(Option::is_some));
+        let mut timer = LapTimer::default();
+        drive(&mut timer, 1);
+        let begun_two = timer.traces.back().expect("a lap").lap;
+        timer.traces.pop_back();
+        timer.on_lap(begun_two - 1, 7.0, "hq");
+        assert!(timer.laps()[0].sectors_s.iter().all(Option::is_some));
     }
 
     /// In the first lap, on the line.
@@ -284,28 +284,28 @@ mod tests {
 
     #[test]
     fn a_jump_passes_no_border() {
-        let mut book = LapTimer::default();
-        book.on_pose(passed(0, 5.0), LENGTH);
-        book.on_pose(passed(25_000_000, 15.0), LENGTH);
-        book.on_pose(passed(9_000_000_000, 16.0), LENGTH);
-        book.on_lap(1, 9.0, "lq");
-        assert_eq!(book.laps()[0].sectors_s, [None; SECTORS]);
+        let mut timer = LapTimer::default();
+        timer.on_pose(passed(0, 5.0), LENGTH);
+        timer.on_pose(passed(25_000_000, 15.0), LENGTH);
+        timer.on_pose(passed(9_000_000_000, 16.0), LENGTH);
+        timer.on_lap(1, 9.0, "lq");
+        assert_eq!(timer.laps()[0].sectors_s, [None; SECTORS]);
     }
 
     #[test]
     fn slip_is_told_as_a_share_of_the_lap() {
-        let mut book = LapTimer::default();
-        book.on_pose(passed(0, 5.0), LENGTH);
+        let mut timer = LapTimer::default();
+        timer.on_pose(passed(0, 5.0), LENGTH);
         for slip in [0.0, 0.05, -0.3, 0.1] {
             let alignment = 0.8;
-            book.on_metrics(&Metrics {
+            timer.on_metrics(&Metrics {
                 slip,
                 alignment,
                 ..Metrics::default()
             });
         }
-        book.on_lap(1, 9.0, "lq");
-        let grip = book.laps()[0].grip.expect("told");
+        timer.on_lap(1, 9.0, "lq");
+        let grip = timer.laps()[0].grip.expect("known");
         assert!((grip.slipping - 0.5).abs() < 1e-9 && (grip.worst_slip - 0.3).abs() < 1e-6);
         assert!((grip.alignment - 0.8).abs() < 1e-6);
     }

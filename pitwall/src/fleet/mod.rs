@@ -1,6 +1,8 @@
 //! All cars, as a pure state: events go in, views come out. No clock, no network.
 
 mod car;
+mod car_view;
+mod clock_estimate;
 mod history;
 mod laps;
 mod log;
@@ -14,14 +16,15 @@ use protocol::{CarName, Event, EventKind, Header, Severity, Telemetry, Topic};
 
 use crate::event::{EventPayload, FleetEvent};
 
-pub use car::{Car, CarView, PoseView, SetView};
+pub use car::Car;
+pub use car_view::{CarView, PoseView, SetView};
 pub use history::{HealthSample, ProfileCell};
 pub use laps::{Lap, LapGrip, SECTORS};
 pub use log::{Log, LogEntry};
 pub use sequence_tracker::{GapSummary, SequenceStatus, SequenceTracker};
 pub use stream_statistics::{StreamStatistics, StreamView};
 
-/// What the pit wall knows.
+/// The state of all cars, and the log.
 ///
 /// A live pit wall and a replay do the same: [`Fleet::apply`] for each event, [`Fleet::tick`] as time passes.
 #[derive(Debug, Clone, Default)]
@@ -31,7 +34,7 @@ pub struct Fleet {
 }
 
 impl Fleet {
-    /// Takes in an event.
+    /// Applies an event.
     pub fn apply(&mut self, event: &FleetEvent) {
         let FleetEvent {
             at,
@@ -55,16 +58,16 @@ impl Fleet {
                 telemetry,
                 ..
             } => {
-                let known = car.take(*topic, header, telemetry, at);
+                let is_new = car.apply(*topic, header, telemetry, at);
                 if let (Telemetry::Event(event), Topic::Event) = (&**telemetry, topic)
-                    && known
+                    && is_new
                 {
                     let when = happened_at(header) - car.clock_offset();
                     self.log.push(entry_of(event, name, when));
                 }
             }
             EventPayload::Unreadable { topic, header, error } => {
-                let first = car.refuse(*topic, header.as_ref(), at);
+                let first = car.note_unreadable(*topic, header.as_ref(), at);
                 if first {
                     self.log.push(LogEntry {
                         number: 0,
@@ -81,24 +84,24 @@ impl Fleet {
             EventPayload::Info(info) => car.info = Some(info.clone()),
             EventPayload::Marker { who, text } => {
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
-                self.say(at, car, Severity::Info, "marker", text, who);
+                self.add_entry(at, car, Severity::Info, "marker", text, who);
             }
             EventPayload::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
             EventPayload::StreamEnds { .. } => {}
         }
-        self.notice_link(&name.clone(), at);
+        self.update_link(&name.clone(), at);
     }
 
-    /// Lets time pass until `now` [unix ns]: cars that have fallen silent are noticed.
+    /// Lets time pass until `now` \[unix ns\]: cars that are silent become BLIND.
     pub fn tick(&mut self, now: i64) {
         let names: Vec<_> = self.cars.keys().cloned().collect();
         for name in names {
-            self.notice_link(&name, now);
+            self.update_link(&name, now);
         }
     }
 
-    /// Adds a line of the pit wall's own to the log.
-    pub fn say(
+    /// Adds an entry of the pit wall itself to the log.
+    pub fn add_entry(
         &mut self,
         at: i64,
         car: Option<CarName>,
@@ -118,7 +121,7 @@ impl Fleet {
         });
     }
 
-    /// Takes note that somebody has seen every alarm so far; says so if there was one.
+    /// Acknowledges every alarm so far, and logs how many there were.
     pub fn acknowledge(&mut self, at: i64, who: &str) {
         let alarms = self.log.acknowledge();
         if alarms > 0 {
@@ -128,7 +131,7 @@ impl Fleet {
                 format!("{alarms} alarms")
             };
             let text = format!("{alarms} acknowledged");
-            self.say(
+            self.add_entry(
                 at,
                 None,
                 Severity::Info,
@@ -149,26 +152,26 @@ impl Fleet {
         self.cars.get(name)
     }
 
-    /// All cars at `now` [unix ns].
+    /// All cars at `now` \[unix ns\].
     pub fn view(&self, now: i64) -> Vec<CarView> {
         self.cars().map(|car| car.view(now)).collect()
     }
 
-    /// What happened.
+    /// The log.
     pub fn log(&self) -> &Log {
         &self.log
     }
 
-    /// Says once when a car falls silent, and once when it is back.
-    fn notice_link(&mut self, name: &CarName, now: i64) {
+    /// Logs once when a car becomes BLIND, and once when it is back.
+    fn update_link(&mut self, name: &CarName, now: i64) {
         let Some(car) = self.cars.get_mut(name) else {
             return;
         };
         let blind = car.blind(now);
-        if blind == car.blind_said || (blind && now - car.first_seen <= Car::BLIND_AFTER) {
+        if blind == car.blind_logged || (blind && now - car.first_seen <= Car::BLIND_AFTER) {
             return;
         }
-        car.blind_said = blind;
+        car.blind_logged = blind;
         let (severity, text) = if !blind {
             (Severity::Info, "link is back")
         } else if car.alive {
@@ -176,7 +179,7 @@ impl Fleet {
         } else {
             (Severity::Critical, "BLIND: the car's node or its link has gone")
         };
-        self.say(now, Some(name.clone()), severity, "link", text.to_owned(), None);
+        self.add_entry(now, Some(name.clone()), severity, "link", text.to_owned(), None);
     }
 }
 
@@ -215,7 +218,7 @@ fn entry_of(event: &Event, car: &CarName, at: i64) -> LogEntry {
     }
 }
 
-/// When an event happened, by the car's clock [unix ns]. Those that no sensor caused carry no sensor time.
+/// When an event happened, by the car's clock \[unix ns\]. An event without a sensor's cause has no sensor time.
 fn happened_at(header: &Header) -> i64 {
     if header.sensor == 0 {
         header.published
@@ -278,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn both_lanes_together_count_each_message_once() {
+    fn live_and_ordered_delivery_count_each_message_once() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
         for (sequence, delivery) in [
@@ -305,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_car_is_blind_and_said_so_once() {
+    fn a_silent_car_is_logged_as_blind_once() {
         let mut fleet = Fleet::default();
         fleet.apply(&appeared(0));
         fleet.apply(&health(0, 1, Delivery::Live, State::Localized));
@@ -316,8 +319,8 @@ mod tests {
         }
         assert_eq!(fleet.view(6 * SECOND)[0].state, "BLIND");
         fleet.apply(&health(7 * SECOND, 2, Delivery::Live, State::Localized));
-        let said: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
-        assert_eq!(said, ["BLIND: nothing comes from the car", "link is back"]);
+        let texts: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
+        assert_eq!(texts, ["BLIND: nothing comes from the car", "link is back"]);
     }
 
     /// The page greys a car whose view is blind. It may show that within 3 s of the last message, so the fleet must know it
@@ -371,23 +374,23 @@ mod tests {
     #[test]
     fn an_alarm_stays_until_it_is_acknowledged() {
         let mut fleet = Fleet::default();
-        fleet.say(1, None, Severity::Critical, "link", "BLIND".into(), None);
-        fleet.say(2, None, Severity::Warning, "link", "slow".into(), None);
+        fleet.add_entry(1, None, Severity::Critical, "link", "BLIND".into(), None);
+        fleet.add_entry(2, None, Severity::Warning, "link", "slow".into(), None);
         assert_eq!(fleet.log().alarms(), 1);
         fleet.acknowledge(3, "ana");
         fleet.acknowledge(4, "ben");
         assert_eq!(fleet.log().alarms(), 0);
-        let said: Vec<_> = fleet
+        let texts: Vec<_> = fleet
             .log()
             .since(2)
             .map(|entry| (entry.text.as_str(), entry.who.as_deref()))
             .collect();
         assert_eq!(
-            said,
+            texts,
             [("1 alarm acknowledged", Some("ana"))],
             "nothing is acknowledged twice"
         );
-        fleet.say(5, None, Severity::Critical, "link", "BLIND".into(), None);
+        fleet.add_entry(5, None, Severity::Critical, "link", "BLIND".into(), None);
         assert_eq!(fleet.log().alarms(), 1);
     }
 

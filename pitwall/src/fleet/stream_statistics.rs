@@ -7,46 +7,46 @@ use serde::Serialize;
 
 use super::sequence_tracker::{SequenceStatus, SequenceTracker};
 
-/// What is known of one topic of one car.
+/// Statistics of one topic of one car.
 #[derive(Debug, Clone, Default)]
 pub struct StreamStatistics {
     gaps: SequenceTracker,
-    /// When the last messages were published, and when the newest arrived [unix ns].
+    /// When the last messages were published, and when the newest arrived \[unix ns\].
     published: VecDeque<i64>,
     arrived: i64,
     newest: Option<Header>,
     unreadable: u64,
-    /// The newest message of all, where that one could not be read.
-    refused: Option<Header>,
-    /// Run and number of messages that could not be read, until one of a later number can: only that one proves that
-    /// there is such a run.
+    /// The header of the newest message, if that one cannot be decoded.
+    newest_unreadable: Option<Header>,
+    /// Run and number of messages that cannot be decoded. They are counted when a later message of the same run is decoded,
+    /// which proves that the run exists.
     unproven: BTreeSet<(u64, u64)>,
     late_by: f64,
-    /// Of the last second: when each arrived [unix ns], and how late [s].
+    /// Messages of the last second: when each arrived \[unix ns\], and how late \[s\].
     transits: VecDeque<(i64, f64)>,
 }
 
-/// What a message was to its stream.
+/// The place of a message in its stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Freshness {
     /// Newer than all before it.
     Newest,
     /// It was missing until now.
     Older,
-    /// It had come already.
+    /// It has arrived already.
     Duplicate,
 }
 
-/// [ns]
+/// \[ns\]
 const SECOND: i64 = 1_000_000_000;
 
 impl StreamStatistics {
-    /// Messages that a rate is taken over.
+    /// Number of messages from which the rate is computed.
     const WINDOW: usize = 64;
-    /// Messages that could not be read and are remembered by their numbers.
+    /// Maximum number of entries in `unproven`.
     const UNPROVEN: usize = 4096;
 
-    /// Takes note of a message that arrived at `at` [unix ns].
+    /// Notes a message that arrived at `at` \[unix ns\].
     pub fn arrive(&mut self, header: &Header, at: i64) -> Freshness {
         let order = |h: &Header| (h.run_id, h.sequence);
         let later = self.unproven.split_off(&order(header));
@@ -70,7 +70,7 @@ impl StreamStatistics {
             self.published.push_back(header.published);
             self.arrived = at;
             self.newest = Some(*header);
-            self.refused = None;
+            self.newest_unreadable = None;
             self.late_by = (at - header.published) as f64 * 1e-9;
             self.transits.push_back((at, self.late_by));
             while self.transits.front().is_some_and(|(then, _)| at - then > SECOND) {
@@ -84,34 +84,33 @@ impl StreamStatistics {
         }
     }
 
-    /// Takes note of bytes that could not be read; returns how many there were. What came and cannot be read is not
-    /// missing.
-    pub fn refuse(&mut self, header: Option<&Header>) -> u64 {
+    /// Notes a message that cannot be decoded; returns how many there were. It has arrived, so it is not missing.
+    pub fn note_unreadable(&mut self, header: Option<&Header>) -> u64 {
         self.unreadable += 1;
         if let Some(header) = header {
             let order = |h: &Header| (h.run_id, h.sequence);
             if self.newest.is_none_or(|newest| order(header) > order(&newest)) {
-                self.refused = Some(*header);
+                self.newest_unreadable = Some(*header);
                 self.unproven.insert(order(header));
                 if self.unproven.len() > Self::UNPROVEN {
                     self.unproven.pop_first();
                 }
             } else {
-                // In the current run it fills its gap; one of an earlier run is left alone.
+                // In the current run it fills its gap. One of an earlier run is ignored.
                 self.gaps.arrive(header.run_id, header.sequence);
             }
         }
         self.unreadable
     }
 
-    /// How many payloads could not be read.
+    /// Number of messages that cannot be decoded.
     pub fn unreadable(&self) -> u64 {
         self.unreadable
     }
 
-    /// The newest message of all, where that one could not be read.
-    pub fn refused(&self) -> Option<Header> {
-        self.refused
+    /// The header of the newest message, if that one cannot be decoded.
+    pub fn newest_unreadable(&self) -> Option<Header> {
+        self.newest_unreadable
     }
 
     /// The newest message's header.
@@ -119,8 +118,8 @@ impl StreamStatistics {
         self.newest
     }
 
-    /// How late messages arrived in the second before `now` [unix ns], the median by both clocks as they are [s], and how
-    /// many did; None when none did.
+    /// Median delay of the messages in the second before `now` \[unix ns\], by the uncorrected clocks \[s\], and their number.
+    /// None when there were none.
     pub fn transit(&self, now: i64) -> Option<(f64, usize)> {
         let mut recent: Vec<f64> = self
             .transits
@@ -132,13 +131,13 @@ impl StreamStatistics {
         Some((*recent.get(recent.len() / 2)?, recent.len()))
     }
 
-    /// When the last message arrived [unix ns].
+    /// When the last message arrived \[unix ns\].
     pub fn last_arrival(&self) -> Option<i64> {
         self.newest.map(|_| self.arrived)
     }
 
-    /// Messages per second, up to `now` [unix ns]; falls when nothing comes. Freshness from when they were published,
-    /// because what a car has kept for us arrives all at once.
+    /// Message rate at `now` \[unix ns\], in Hz; it falls when nothing arrives. It is computed from the publish times,
+    /// because recovered messages arrive all at once.
     pub fn rate(&self, now: i64) -> f64 {
         let (Some(first), Some(last)) = (self.published.front(), self.published.back()) else {
             return 0.0;
@@ -154,7 +153,7 @@ impl StreamStatistics {
         intervals / (span + (pause - usual).max(0.0)).max(1e-9)
     }
 
-    /// The stream at `now` [unix ns], the car's clock being `offset` [ns] ahead of the laptop's.
+    /// The stream at `now` \[unix ns\]. The car's clock is `offset` \[ns\] ahead of the laptop's.
     pub fn view(&self, now: i64, offset: i64) -> StreamView {
         let seconds = |ns: i64| ns as f64 * 1e-9;
         StreamView {
@@ -173,21 +172,21 @@ impl StreamStatistics {
 /// A stream in numbers.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StreamView {
-    /// Messages per second [Hz].
+    /// Message rate \[Hz\].
     pub rate_hz: f64,
-    /// Time since the newest content was true [s].
+    /// Age of the newest content \[s\].
     pub age_s: Option<f64>,
-    /// From publishing to arrival, of the newest message [s].
+    /// From publishing to arrival, of the newest message \[s\].
     pub transit_s: Option<f64>,
-    /// Different messages that came.
+    /// Messages that arrived, duplicates not counted.
     pub received: u64,
-    /// Messages that were sent and did not come.
+    /// Messages that were sent and did not arrive.
     pub missing: u64,
-    /// Messages that came late, out of the sender's cache.
+    /// Messages that arrived late, from the sender's cache.
     pub filled_late: u64,
-    /// How often the sender started again.
+    /// How often the sender restarted.
     pub sender_restarts: u64,
-    /// Payloads that could not be read.
+    /// Messages that cannot be decoded.
     pub unreadable: u64,
 }
 
@@ -225,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn a_burst_of_what_was_kept_is_no_high_rate() {
+    fn recovered_messages_do_not_raise_the_rate() {
         let mut stream = StreamStatistics::default();
         for i in 0..20 {
             stream.arrive(&published(i + 1, i as i64 * SECOND), 20 * SECOND);
@@ -236,9 +235,9 @@ mod tests {
     #[test]
     fn an_older_message_fills_a_gap_but_is_not_newer() {
         let mut stream = StreamStatistics::default();
-        let taken = [1, 3, 2, 3].map(|number| stream.arrive(&header(number), 0));
+        let freshness = [1, 3, 2, 3].map(|number| stream.arrive(&header(number), 0));
         assert_eq!(
-            taken,
+            freshness,
             [
                 Freshness::Newest,
                 Freshness::Newest,
@@ -251,24 +250,24 @@ mod tests {
     }
 
     #[test]
-    fn what_came_and_cannot_be_read_is_not_missing() {
+    fn an_unreadable_message_is_not_missing() {
         let mut stream = StreamStatistics::default();
         stream.arrive(&header(1), 0);
-        stream.refuse(Some(&header(2)));
-        stream.refuse(Some(&header(3)));
+        stream.note_unreadable(Some(&header(2)));
+        stream.note_unreadable(Some(&header(3)));
         stream.arrive(&header(6), 0);
-        stream.refuse(Some(&header(5)));
+        stream.note_unreadable(Some(&header(5)));
         let view = stream.view(0, 0);
         assert_eq!((view.received, view.missing, view.unreadable), (5, 1, 3));
     }
 
     #[test]
-    fn an_unreadable_header_of_nobody_stops_no_stream() {
+    fn a_forged_header_does_not_stop_a_stream() {
         let mut stream = StreamStatistics::default();
         let mut forged = header(u64::MAX);
         forged.run_id = u64::MAX;
         for number in 1..4 {
-            stream.refuse(Some(&forged));
+            stream.note_unreadable(Some(&forged));
             assert_eq!(stream.arrive(&header(number), 0), Freshness::Newest);
         }
         let view = stream.view(0, 0);

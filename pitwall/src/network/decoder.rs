@@ -25,7 +25,7 @@ const MISSING_TIMEOUT: Duration = Duration::from_secs(3);
 /// An input of the decoder's thread.
 #[expect(clippy::large_enum_variant, reason = "nearly all of them are samples")]
 pub(super) enum DecoderInput {
-    /// A sample, with the time of its arrival [unix ns].
+    /// A sample, with the time of its arrival \[unix ns\].
     Sample {
         at: i64,
         delivery: Delivery,

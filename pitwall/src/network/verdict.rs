@@ -13,7 +13,7 @@ pub enum Verdict {
     Answered {
         /// The answer.
         answer: Answer,
-        /// From the command to the answer [s].
+        /// From the command to the answer \[s\].
         after_s: f64,
     },
     /// No car of this name is connected. Nothing has changed.
@@ -21,7 +21,7 @@ pub enum Verdict {
     /// The car was connected and has not answered in time. It may or may not have executed the command. Check the set in
     /// force, or send the same command again, which is harmless.
     NoAnswer {
-        /// How long the program waited [s].
+        /// How long the program waited \[s\].
         waited_s: f64,
         /// True when the car has disconnected in the meantime.
         gone: bool,

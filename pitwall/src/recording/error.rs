@@ -11,7 +11,7 @@ pub enum RecordingError {
     Io {
         /// The file.
         file: String,
-        /// What the system says.
+        /// The error of the system.
         reason: std::io::Error,
     },
     /// Writing the file failed.
@@ -22,8 +22,8 @@ pub enum RecordingError {
         /// What is wrong.
         reason: mcap::McapError,
     },
-    /// The file is something else.
-    #[error("{0} is not a recording: it does not begin as an MCAP file does")]
+    /// The file is not MCAP.
+    #[error("{0} is not a recording: it does not start as an MCAP file does")]
     Foreign(String),
     /// The file was cut off, or is damaged.
     #[error("{file}: {reason}; `pitwall recover {file}` saves the intact part")]
@@ -33,7 +33,7 @@ pub enum RecordingError {
         /// What is wrong.
         reason: String,
     },
-    /// Not one message can be read.
+    /// No message is intact.
     #[error("{file}: nothing can be saved, {reason}")]
     Nothing {
         /// The file.
@@ -41,8 +41,8 @@ pub enum RecordingError {
         /// Why.
         reason: String,
     },
-    /// The file is a recording of nothing.
-    #[error("{0} holds no event of any car")]
+    /// The recording has no event.
+    #[error("{0} has no event of any car")]
     Empty(String),
 }
 

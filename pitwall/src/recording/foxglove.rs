@@ -1,4 +1,4 @@
-//! Messages as JSON for the tools that everybody has, in Foxglove's schemas where there is one.
+//! Converts messages to JSON for other tools, in Foxglove's schemas if there is one.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
@@ -17,7 +17,7 @@ pub(super) struct Exported {
     pub(super) json: Value,
 }
 
-/// What other tools get to see of a message that came on a live topic.
+/// The JSON messages for a message on a live topic.
 pub(super) fn export(car: &CarName, header: &Header, telemetry: &Telemetry) -> Vec<Exported> {
     let exported = |channel, schema, json| Exported {
         channel,
@@ -62,7 +62,7 @@ pub(super) fn export(car: &CarName, header: &Header, telemetry: &Telemetry) -> V
     }
 }
 
-/// The map as other tools get to see it.
+/// The map as JSON.
 pub(super) fn export_map(map: &MapReply, at: i64) -> Exported {
     let data = map.occupancy();
     Exported {
@@ -94,7 +94,7 @@ pub(super) fn schema(name: &str, example: &Value) -> Value {
     schema
 }
 
-/// What a value's type says of all values in its place. An absent value may turn out to be anything.
+/// The schema of a value's type. A null value may be of any type.
 fn shape(value: &Value) -> Value {
     match value {
         Value::Null => json!({}),

@@ -1,13 +1,13 @@
-//! Recordings: one MCAP file per session, all cars.
+//! Recordings: one MCAP file with all cars.
 //!
-//! Every message is written twice. The bytes as they came, under the key they came on, are what a replay reads:
-//! it sees the same events as the live pit wall did. Beside them, under `/<car>/...`, stand the same contents as
-//! JSON in Foxglove's schemas where there is one, for the tools that everybody has.
+//! Every message is written twice. A replay reads the bytes as received, under the key of the message, and therefore has
+//! the same events as the live pit wall. Other tools read the same content as JSON under `/<car>/...`, in Foxglove's
+//! schemas if there is one.
 //!
 //! | channel | encoding | content |
 //! |---|---|---|
-//! | `synpf/v1/<car>/<topic>` | `synpf-v1` | the message as it came, header and all |
-//! | `pitwall/<car>/note` | json | what no message carries: a car came or went, its clock, unreadable payloads |
+//! | `synpf/v1/<car>/<topic>` | `synpf-v1` | the message as received, with its header |
+//! | `pitwall/<car>/note` | json | events that are not messages: a car appeared or vanished, its clock, unreadable messages |
 //! | `/<car>/pose` | json, `foxglove.PoseInFrame` | pose of `base_link` in `map` |
 //! | `/<car>/tf` | json, `foxglove.FrameTransform` | the same as a transform |
 //! | `/<car>/cloud` | json, `foxglove.PosesInFrame` | particles |

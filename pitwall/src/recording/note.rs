@@ -1,4 +1,4 @@
-//! What a recording holds beside messages.
+//! Events in a recording that are not messages.
 
 use std::sync::Arc;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::event::EventPayload;
 
-/// A payload that no message carries.
+/// An event that is not a message.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "note")]
 pub(super) enum Note {
@@ -15,7 +15,7 @@ pub(super) enum Note {
     Vanished,
     Unreadable {
         topic: Topic,
-        /// Recordings of before have none.
+        /// Older recordings have none.
         #[serde(default)]
         header: Option<Header>,
         error: String,
@@ -34,7 +34,7 @@ pub(super) enum Note {
 }
 
 impl Note {
-    /// What every note's channel begins with.
+    /// Start of every note's channel.
     pub(super) const PREFIX: &str = "pitwall/";
     const SUFFIX: &str = "/note";
 
@@ -51,7 +51,7 @@ impl Note {
             .ok()
     }
 
-    /// The note for a payload; None for those that are bytes of their own.
+    /// The note for a payload; None for a payload that is stored as bytes.
     pub(super) fn of(payload: &EventPayload) -> Option<Self> {
         Some(match payload {
             EventPayload::Appeared => Self::Appeared,

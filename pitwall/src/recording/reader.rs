@@ -237,7 +237,7 @@ pub(super) mod tests {
         std::fs::write(&path, &bytes[..bytes.len() - mcap::MAGIC.len()]).expect("written");
         let events: Vec<_> = read_events(&path).expect("opens").collect();
         assert_eq!(events.len(), 101);
-        let error = events[100].as_ref().err().expect("the last").to_string();
+        let error = events[100].as_ref().expect_err("the last").to_string();
         assert!(error.contains("session.mcap: the file was cut off"), "{error}");
     }
 

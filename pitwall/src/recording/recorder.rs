@@ -1,4 +1,4 @@
-//! Records on a thread of its own.
+//! Records on its own thread.
 
 use std::fs::{File, OpenOptions};
 use std::io::BufWriter;
@@ -20,7 +20,7 @@ use crate::event::FleetEvent;
 const SYNC_EVERY: Duration = Duration::from_millis(300);
 /// A sync that takes longer than this is reported, because then a power cut can lose more than a second.
 const SLOW_SYNC: Duration = Duration::from_millis(700);
-/// Events that may wait for a slow disk: about a minute of ten cars.
+/// Maximum number of events that wait for a slow disk: about a minute of ten cars.
 const QUEUE: usize = 200_000;
 
 /// A recording in progress.
@@ -31,25 +31,25 @@ pub struct Recorder {
     status: Arc<Mutex<RecorderStatus>>,
 }
 
-/// How a recording is getting on.
+/// State of a recording.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct RecorderStatus {
     /// Bytes in the file.
     pub bytes: u64,
     /// Events that were not recorded because the disk was too slow.
     pub overrun: u64,
-    /// What is in the file so far.
+    /// Content of the file so far.
     pub summary: RecordingSummary,
-    /// Why recording has failed, if it has.
+    /// Why the recording has failed; None while it has not.
     pub error: Option<String>,
 }
 
-/// How a recording is getting on, in short.
+/// Progress of a recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RecordingProgress {
     /// Bytes in the file.
     pub bytes: u64,
-    /// From the first event to the last [s].
+    /// From the first event to the last \[s\].
     pub seconds: f64,
     /// Messages and notes.
     pub messages: u64,
@@ -57,12 +57,12 @@ pub struct RecordingProgress {
     pub missing: u64,
     /// Events that were not recorded because the disk was too slow.
     pub overrun: u64,
-    /// Why recording has failed, if it has.
+    /// Why the recording has failed; None while it has not.
     pub error: Option<String>,
 }
 
 impl Recorder {
-    /// Creates the file and begins. Never overwrites.
+    /// Creates the file and starts to record. Never overwrites a file.
     pub fn start(path: &Path) -> Result<Self, RecordingError> {
         let file = OpenOptions::new()
             .write(true)
@@ -93,7 +93,7 @@ impl Recorder {
         })
     }
 
-    /// Takes in an event; never waits.
+    /// Records an event. Never waits.
     pub fn record(&self, event: &Arc<FleetEvent>) {
         if self.events.try_send(event.clone()).is_err() {
             self.status.lock().unwrap_or_else(PoisonError::into_inner).overrun += 1;
@@ -105,12 +105,12 @@ impl Recorder {
         &self.path
     }
 
-    /// How it is getting on.
+    /// The state.
     pub fn status(&self) -> RecorderStatus {
         self.status.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// How it is getting on, in short: cheap enough to be asked for many times a second.
+    /// The progress. Cheap enough to call many times a second.
     pub fn progress(&self) -> RecordingProgress {
         let status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         RecordingProgress {
@@ -123,7 +123,7 @@ impl Recorder {
         }
     }
 
-    /// Writes what is left, ends the file and says what is in it. Waits for the disk.
+    /// Writes the remaining events, completes the file and returns its summary. Waits for the disk.
     pub fn finish(self) -> Result<RecordingSummary, RecordingError> {
         drop(self.events);
         self.thread.join().unwrap_or_else(|_| {

@@ -135,7 +135,7 @@ fn copy(input: &File, from: &Path, output: File, to: &Path) -> Result<Recovered,
             break;
         }
         for record in records {
-            copy.take(record).map_err(written)?;
+            copy.add(record).map_err(written)?;
         }
     }
     copy.writer.finish().map_err(written)?;
@@ -167,7 +167,7 @@ struct Copy {
 }
 
 impl Copy {
-    fn take(&mut self, record: Salvaged) -> Result<(), McapError> {
+    fn add(&mut self, record: Salvaged) -> Result<(), McapError> {
         match record {
             Salvaged::Header { .. } => {}
             Salvaged::DataEnd => self.in_summary = true,
@@ -206,8 +206,7 @@ impl Copy {
                 self.metadata += 1;
             }
             Salvaged::Private { opcode, data } => {
-                self.writer
-                    .write_private_record(opcode, &data, Default::default())?;
+                self.writer.write_private_record(opcode, &data, <_>::default())?;
             }
             Salvaged::Statistics(statistics) => self.statistics = Some(statistics),
             Salvaged::Damage(reason) => self.add_damage(reason),
@@ -218,7 +217,7 @@ impl Copy {
 
     fn add_channel(&mut self, channel: &Channel) -> Result<u16, McapError> {
         if let Some((header, data)) = self.definitions.schemas.get(&channel.schema_id) {
-            // An id that is known already with another content is the file's own.
+            // Fails when the file has defined this id differently; then its own definition stays.
             self.writer
                 .add_schema_with_id(header.id, &header.name, &header.encoding, data)
                 .ok();
@@ -232,7 +231,7 @@ impl Copy {
         )
     }
 
-    /// Passes on what the writer did. An error of the disk ends the recovery; a record that the writer refuses is damage.
+    /// Handles the outcome of a write. A disk error ends the recovery. A record that the writer rejects is damage.
     fn note<T>(&mut self, outcome: Result<T, McapError>) -> Result<Option<T>, McapError> {
         match outcome {
             Ok(value) => Ok(Some(value)),
@@ -376,7 +375,7 @@ mod tests {
         assert!(text.starts_with("FILE: No such file"), "{text}");
         for content in ["", "hello", "a text that is longer than the magic bytes"] {
             fs::write(file, content).expect("written");
-            let foreign = "FILE is not a recording: it does not begin as an MCAP file does";
+            let foreign = "FILE is not a recording: it does not start as an MCAP file does";
             assert_eq!(fault(recover(file, to), file), foreign);
             assert_eq!(fault(read_events(file), file), foreign);
         }

@@ -222,7 +222,7 @@ impl<'a> Fields<'a> {
 fn after_fields(opcode: u8, body: &[u8]) -> Option<usize> {
     let mut fields = Fields(body);
     match opcode {
-        op::HEADER => {
+        op::HEADER | op::METADATA => {
             fields.sized(4)?;
             fields.sized(4)?;
         }
@@ -261,10 +261,6 @@ fn after_fields(opcode: u8, body: &[u8]) -> Option<usize> {
         }
         op::STATISTICS => {
             fields.take(42)?;
-            fields.sized(4)?;
-        }
-        op::METADATA => {
-            fields.sized(4)?;
             fields.sized(4)?;
         }
         op::DATA_END => drop(fields.take(4)?),

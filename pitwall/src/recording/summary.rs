@@ -1,4 +1,4 @@
-//! What a finished recording holds and what is missing in it.
+//! The content of a recording, and what is missing in it.
 
 use std::fmt;
 
@@ -7,16 +7,16 @@ use serde::Serialize;
 
 use crate::fleet::GapSummary;
 
-/// What is in a recording, and what is not.
+/// The content of a recording, and what is missing in it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct RecordingSummary {
-    /// From the first event to the last [s].
+    /// From the first event to the last \[s\].
     pub duration_s: f64,
     /// Messages and notes.
     pub messages: u64,
     /// Every stream.
     pub streams: Vec<StreamSummary>,
-    /// Cars that did not say at the end how far their streams go: what they sent last may be missing, uncounted.
+    /// Cars that did not answer the final sync. Their last messages may be missing and are not counted.
     pub unanswered: Vec<CarName>,
 }
 
@@ -27,10 +27,10 @@ pub struct StreamSummary {
     pub car: CarName,
     /// The topic.
     pub topic: Topic,
-    /// How long before the end of the car's recording its last message here was published [s]. The end is when the car
-    /// said how far its streams go, or else its last message on any topic. None where that was before it started again.
+    /// Time from the stream's last message to the end of the car's recording \[s\]. The end is the final sync, or else the
+    /// car's last message on any topic. None when the stream has no message in the car's last run.
     pub behind_s: Option<f64>,
-    /// What came and what did not.
+    /// What arrived and what is missing.
     #[serde(flatten)]
     pub gaps: GapSummary,
 }
@@ -72,7 +72,7 @@ impl fmt::Display for RecordingSummary {
         for car in &self.unanswered {
             writeln!(
                 f,
-                "{car} did not answer at the end: what it sent last may be missing, too"
+                "{car} did not answer at the end: its last messages may be missing, too"
             )?;
         }
         let missing = match self.missing() {

@@ -1,4 +1,4 @@
-//! What of a recording cannot be read: a program of another version wrote it, or it was damaged on its way.
+//! Messages in a recording that cannot be decoded, because of their version or of damage in transit.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::event::{EventPayload, FleetEvent};
 
-/// Messages of one stream that cannot be read.
+/// Messages of one stream that cannot be decoded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Unreadable {
     /// The car.
@@ -17,7 +17,7 @@ pub struct Unreadable {
     pub topic: Topic,
     /// How many.
     pub messages: u64,
-    /// What is wrong with the first of them.
+    /// The error of the first of them.
     pub error: String,
 }
 
@@ -35,18 +35,18 @@ impl fmt::Display for Unreadable {
         };
         write!(
             f,
-            "{car} {topic}: {messages} left out, which cannot be read: {error}"
+            "{car} {topic}: {messages} left out because they cannot be decoded: {error}"
         )
     }
 }
 
-/// Counts what cannot be read.
+/// Counts messages that cannot be decoded, by stream.
 #[derive(Debug, Default)]
 pub struct UnreadableCount(BTreeMap<(CarName, Topic), (u64, String)>);
 
 impl UnreadableCount {
-    /// Takes note of an event.
-    pub fn take(&mut self, event: &FleetEvent) {
+    /// Counts an event if it is unreadable.
+    pub fn add(&mut self, event: &FleetEvent) {
         if let EventPayload::Unreadable { topic, error, .. } = &event.payload {
             let (messages, _) = self
                 .0
@@ -56,7 +56,7 @@ impl UnreadableCount {
         }
     }
 
-    /// What there was, by stream.
+    /// The counts by stream.
     pub fn list(&self) -> Vec<Unreadable> {
         let of = |((car, topic), (messages, error)): (&(CarName, Topic), &(u64, String))| Unreadable {
             car: car.clone(),
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_of_another_version_are_left_out_and_told() {
+    fn messages_of_another_version_are_left_out_and_reported() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("session.mcap");
         let file = std::fs::File::create(&path).expect("a file");
@@ -133,10 +133,10 @@ mod tests {
             .collect();
         assert_eq!(read, [true, false, true, false, true, false, true]);
         let report = Report::of(&path).expect("a report");
-        let told: Vec<_> = report.unreadable.iter().map(ToString::to_string).collect();
-        let expected = "car-1 event: 3 messages are left out, which cannot be read: Event has version 99, this program \
+        let texts: Vec<_> = report.unreadable.iter().map(ToString::to_string).collect();
+        let expected = "car-1 event: 3 messages are left out because they cannot be decoded: Event has version 99, this program \
                         reads version 3: update the older side";
-        assert_eq!(told, [expected]);
+        assert_eq!(texts, [expected]);
         assert_eq!(
             report.cars[0].missing, 1,
             "number 7; the others are left out, not missing"

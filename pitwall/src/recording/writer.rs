@@ -13,9 +13,9 @@ use super::summary::{RecordingSummary, StreamSummary};
 use crate::event::{EventPayload, FleetEvent, SentRange};
 use crate::fleet::{SequenceStatus, SequenceTracker};
 
-/// Encoding of messages as they came.
+/// Encoding of messages that are stored as received.
 pub(super) const WIRE_ENCODING: &str = "synpf-v1";
-/// Name of the metadata record that says what is in the file.
+/// Name of the metadata record with the gaps of each stream.
 pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
 
 /// A stream being recorded.
@@ -26,10 +26,10 @@ struct RecordedStream {
     until: PublishTime,
 }
 
-/// The run and the time of publishing and its clock [unix ns].
+/// The run, and the time of publishing by the car's clock \[unix ns\].
 type PublishTime = (u64, i64);
 
-/// How far a car's streams go: what it published later is not recorded, so that they all end together.
+/// The end of a car's streams. Later messages are not recorded, so that all streams end together.
 type End = PublishTime;
 
 /// A recording being written.
@@ -38,7 +38,7 @@ pub(super) struct RecordingWriter<W: Write + Seek> {
     channels: HashMap<String, u16>,
     schemas: HashMap<&'static str, u16>,
     streams: BTreeMap<Key, RecordedStream>,
-    /// Where the recording ends, for each car that has said so.
+    /// The end of each car that has answered the final sync.
     ends: BTreeMap<CarName, End>,
     notes: u32,
     messages: u64,
@@ -64,7 +64,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
         })
     }
 
-    /// Writes an event. A message that is in the file already is not written again, and none from after the end.
+    /// Writes an event, but not a duplicate and not a message from after the end.
     pub(super) fn write(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
         let FleetEvent { at, car, payload } = event;
         match payload {
@@ -92,7 +92,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
                     sequence: header.sequence as u32,
                 };
                 self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
-                // The full-rate twins of live topics would only repeat them.
+                // The full-rate streams would repeat the live ones.
                 if !topic.recorded() || *topic == Topic::RecordedTruth {
                     for exported in foxglove::export(car, header, telemetry) {
                         self.write_json(car, &exported, times)?;
@@ -145,12 +145,12 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.writer.attach(attachment)
     }
 
-    /// Puts everything written so far into the file.
+    /// Flushes everything written so far to the file.
     pub(super) fn flush(&mut self) -> Result<(), mcap::McapError> {
         self.writer.flush()
     }
 
-    /// What is in the file.
+    /// Content of the file so far.
     pub(super) fn summary(&self) -> RecordingSummary {
         let mut ends = self.ends.clone();
         for (key, stream) in &self.streams {
@@ -181,7 +181,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
         }
     }
 
-    /// Writes the summary and the index, and ends the file.
+    /// Writes the summary and the index, and completes the file.
     pub(super) fn finish(mut self) -> Result<(RecordingSummary, W), mcap::McapError> {
         let mut summary = self.summary();
         let mut cars: Vec<_> = self.streams.into_keys().map(|key| key.car).collect();

@@ -3,15 +3,15 @@
 use protocol::Cell;
 
 use super::svg::{Plot, WIDTH, escape};
-use super::{CarReport, Vital, error_of};
+use super::{CarReport, HealthPoint, error_of};
 
-/// A figure and what it shows.
+/// A figure with its caption.
 pub(super) struct Figure {
     pub(super) title: &'static str,
     pub(super) svg: String,
 }
 
-/// Those that the recording has data for.
+/// The figures for which the recording has data.
 pub(super) fn of(car: &CarReport, duration_s: f64) -> Vec<Figure> {
     let figure = |title, svg: Option<String>| svg.map(|svg| Figure { title, svg });
     [
@@ -48,7 +48,7 @@ pub(super) fn of(car: &CarReport, duration_s: f64) -> Vec<Figure> {
     .collect()
 }
 
-/// Places of a lap.
+/// Number of places of a lap.
 const PLACES: usize = 100;
 
 fn place_of(s: f64, length: f64) -> usize {
@@ -61,7 +61,7 @@ fn along(
     name: &str,
     range: [f64; 2],
     limits: &[f64],
-    value: impl Fn(&Vital) -> f64,
+    value: impl Fn(&HealthPoint) -> f64,
     worst: impl Fn(f64, f64) -> f64,
 ) -> Option<String> {
     let length = car.series.length?;
@@ -109,7 +109,7 @@ fn over_lap(
         let (sum, count, extreme) = &mut cells[place_of(s, length)];
         *sum += value;
         *count += 1;
-        // NaN gives way to any number.
+        // Any number replaces NaN.
         *extreme = worst(*extreme, value);
     }
     let at = |i: usize| (i as f64 + 0.5) / PLACES as f64 * length;
@@ -128,7 +128,7 @@ fn laps(car: &CarReport) -> Option<String> {
     let worst = car.laps.iter().map(|lap| lap.time_s).fold(best, f64::max);
     let last = car.laps.last()?.lap;
     let range = [0.5, f64::from(last) + 0.5];
-    // From just below the best, so that differences show.
+    // The axis starts just below the best time, so that differences are visible.
     let low = (best - 0.3 * (worst - best) - 0.05 * best).max(0.0);
     let mut plot = Plot::new(range, [low, worst * 1.01], ["lap", "time [s]"]);
     plot.bars(
@@ -144,7 +144,7 @@ fn laps(car: &CarReport) -> Option<String> {
 
 fn states(car: &CarReport, duration_s: f64) -> Option<String> {
     let healths = &car.series.healths;
-    let rank = |v: &Vital| match v.state {
+    let rank = |v: &HealthPoint| match v.state {
         protocol::State::Localized => 3.0,
         protocol::State::Degraded => 2.0,
         protocol::State::Init | protocol::State::Converging | protocol::State::Relocalizing => 1.0,
@@ -164,7 +164,7 @@ fn error(car: &CarReport) -> Option<String> {
     let first = poses.first()?.sensor;
     let last = poses.last()?.sensor;
     let seconds = |at: i64| (at - first) as f64 * 1e-9;
-    // As many points as the plot has pixels, each the worst of its time.
+    // One point per pixel, each the worst of its interval.
     let slots = WIDTH as usize;
     let mut worst = vec![f64::NAN; slots];
     for spot in poses {
@@ -211,7 +211,7 @@ fn track(car: &CarReport) -> Option<String> {
         [map.origin.x + cos * u - sin * v, map.origin.y + sin * u + cos * v]
     };
     let width = map.width.max(1) as usize;
-    // Runs of walls as strokes along their rows: a fraction of the cells' number.
+    // One stroke for each run of walls in a row, which is a fraction of the number of cells.
     let (mut walls, mut at) = (String::new(), 0_usize);
     let mut extent = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
     for &(cell, length) in &map.runs {
@@ -246,7 +246,7 @@ fn track(car: &CarReport) -> Option<String> {
     let begin = series.poses[0].sensor;
     let first_health = series.healths.first().map_or(0.0, |v| v.at_s);
     let mut before: Option<[f64; 2]> = None;
-    // A few thousand points say as much as all.
+    // A few thousand points are enough.
     for spot in series.poses.iter().step_by(series.poses.len() / 6000 + 1) {
         let at_s = (spot.sensor - begin) as f64 * 1e-9 + first_health;
         while let Some(vital) = health.next_if(|vital| vital.at_s <= at_s) {

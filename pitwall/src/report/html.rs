@@ -1,4 +1,4 @@
-//! The page around the numbers and figures: no script, nothing loaded from anywhere.
+//! The HTML page of the numbers and figures. It has no script and loads nothing.
 
 use super::svg::escape;
 use super::{CarReport, MeanSigma, Report, figures};

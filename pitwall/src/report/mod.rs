@@ -1,10 +1,9 @@
-//! What a recording says: laps, sectors, how well each car was localized and where, its load, and true error where
-//! the truth was recorded.
+//! Reports on a recording: laps, sectors, health over the lap, load, and the true error if the truth was recorded.
 //!
-//! [`Report::of`] turns events into numbers, [`Report::to_html`] those into one page that stands alone.
+//! [`Report::of`] computes the numbers. [`Report::to_html`] writes them with figures into one HTML file.
 #![allow(
     clippy::format_push_string,
-    reason = "a page is put together once: reading well counts for more than an allocation"
+    reason = "the page is built once, so readability matters more than an allocation"
 )]
 mod figures;
 mod html;
@@ -21,18 +20,18 @@ use crate::fleet::Fleet;
 use crate::fleet::Lap;
 use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
 
-/// Everything that the report says.
+/// The report on a recording.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     /// The recording.
     pub file: String,
-    /// From the first event to the last [s].
+    /// From the first event to the last \[s\].
     pub duration_s: f64,
     /// Each car by name.
     pub cars: Vec<CarReport>,
-    /// Markers and what else the engineers said or did, in order.
+    /// Markers and actions of the operators, in order.
     pub notes: Vec<String>,
-    /// What is in the recording and cannot be read.
+    /// The messages that cannot be decoded.
     pub unreadable: Vec<Unreadable>,
 }
 
@@ -43,17 +42,17 @@ pub struct CarReport {
     pub car: CarName,
     /// Its laps.
     pub laps: Vec<Lap>,
-    /// Table I of the paper, a row for each set that laps were driven on.
+    /// Table I of the paper, with a row for each set.
     pub table: Vec<TableRow>,
     /// Share of the time in each state, in `[0, 1]`.
     pub states: BTreeMap<String, f64>,
-    /// Critical log lines.
+    /// Critical log entries.
     pub alarms: usize,
-    /// Error of the pose against the truth; None where no truth was recorded.
+    /// Error of the pose against the truth; None if no truth was recorded.
     pub truth: Option<TrueError>,
     /// Mean CPU of the node, 1 being one core; None without load messages.
     pub cpu: Option<f64>,
-    /// The worst update time, 99th percentile over a second [ms]; None without load messages.
+    /// The worst update time, 99th percentile over a second \[ms\]; None without load messages.
     pub update_p99_ms: Option<f64>,
     /// Messages that were sent and are not in the recording.
     pub missing: u64,
@@ -61,16 +60,16 @@ pub struct CarReport {
     series: Series,
 }
 
-/// A row of the paper's table I: laps on one set.
+/// A row of the paper's table I: the laps on one set.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TableRow {
     /// The set in force at the end of these laps.
     pub set: String,
-    /// How many.
+    /// Number of laps.
     pub laps: usize,
-    /// Lap time, mean and standard deviation [s].
+    /// Lap time, mean and standard deviation \[s\].
     pub time_s: MeanSigma,
-    /// Mean distance of the estimate from the raceline, over the laps [m]; None without poses.
+    /// Mean distance of the estimate from the raceline, over the laps \[m\]; None without poses.
     pub lateral_m: Option<MeanSigma>,
     /// Mean alignment, in `[0, 1]`; None without health messages.
     pub alignment: Option<f64>,
@@ -85,46 +84,46 @@ pub struct MeanSigma {
     pub sigma: f64,
 }
 
-/// How far the published pose was from the truth.
+/// Error of the published pose against the truth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TrueError {
     /// Poses compared.
     pub poses: usize,
-    /// Root mean square distance [m].
+    /// Root mean square distance \[m\].
     pub rmse_m: f64,
-    /// Root mean square along the heading [m].
+    /// Root mean square along the heading \[m\].
     pub along_m: f64,
-    /// Root mean square across the heading [m].
+    /// Root mean square across the heading \[m\].
     pub across_m: f64,
-    /// Root mean square of the heading's error [rad].
+    /// Root mean square of the heading's error \[rad\].
     pub heading_rad: f64,
-    /// The greatest distance [m].
+    /// Maximum distance \[m\].
     pub max_m: f64,
 }
 
-/// What figures are drawn from. Times are seconds since the recording's begin.
+/// Data of the figures. Times are seconds since the recording's start.
 #[derive(Debug, Clone, Default)]
 struct Series {
     map: Option<std::sync::Arc<MapReply>>,
     length: Option<f64>,
-    poses: Vec<Spot>,
-    healths: Vec<Vital>,
+    poses: Vec<PosePoint>,
+    healths: Vec<HealthPoint>,
     loads: Vec<[f64; 3]>,
     truths: Vec<(i64, Pose2)>,
 }
 
 /// A pose.
 #[derive(Debug, Clone, Copy)]
-struct Spot {
+struct PosePoint {
     sensor: i64,
     pose: Pose2,
-    /// ProfileCell along and off the raceline [m].
+    /// Arc length on the raceline and distance from it \[m\].
     track: Option<[f64; 2]>,
 }
 
-/// A health message, with the place along the raceline where the car was [m].
+/// A health message, with the car's arc length on the raceline \[m\].
 #[derive(Debug, Clone, Copy)]
-struct Vital {
+struct HealthPoint {
     at_s: f64,
     s: Option<f64>,
     state: State,
@@ -133,7 +132,7 @@ struct Vital {
 }
 
 impl MeanSigma {
-    /// None for no value.
+    /// None without a value.
     fn of(values: &[f64]) -> Option<Self> {
         let count = values.len() as f64;
         let mean = values.iter().sum::<f64>() / count;
@@ -154,14 +153,14 @@ impl Report {
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut collector = Collector::default();
         for event in read_events(path)? {
-            collector.take(&event?);
+            collector.add(&event?);
         }
         collector
             .report(path)
             .ok_or_else(|| RecordingError::Empty(path.display().to_string()))
     }
 
-    /// The report as one page, with its figures in it.
+    /// The report as one HTML page with its figures.
     pub fn to_html(&self) -> String {
         html::page(self)
     }
@@ -173,23 +172,23 @@ struct Collector {
     span: Option<(i64, i64)>,
     ticked: i64,
     series: BTreeMap<CarName, Series>,
-    full_rate: BTreeMap<CarName, Vec<Spot>>,
+    full_rate: BTreeMap<CarName, Vec<PosePoint>>,
     unreadable: UnreadableCount,
 }
 
 impl Collector {
-    fn take(&mut self, event: &FleetEvent) {
+    fn add(&mut self, event: &FleetEvent) {
         const TICK: i64 = 100_000_000;
         let (from, _) = *self.span.get_or_insert((event.at, event.at));
         self.span = Some((from, event.at.max(from)));
-        // Time passes as it did, so that silence is noticed.
+        // Time passes as it did, so that BLIND cars are noticed.
         self.ticked = self.ticked.max(from);
         while self.ticked + TICK < event.at {
             self.ticked += TICK;
             self.fleet.tick(self.ticked);
         }
         self.fleet.apply(event);
-        self.unreadable.take(event);
+        self.unreadable.add(event);
         let at_s = (event.at - from) as f64 * 1e-9;
         let series = self.series.entry(event.car.clone()).or_default();
         let EventPayload::Message {
@@ -203,22 +202,22 @@ impl Collector {
         };
         match &**telemetry {
             Telemetry::Pose(pose) => {
-                let spot = Spot {
+                let point = PosePoint {
                     sensor: header.sensor,
                     pose: pose.pose,
                     track: pose.track.map(|track| [track.s, track.d]),
                 };
                 if topic.recorded() {
-                    self.full_rate.entry(event.car.clone()).or_default().push(spot);
+                    self.full_rate.entry(event.car.clone()).or_default().push(point);
                 } else {
-                    series.poses.push(spot);
+                    series.poses.push(point);
                 }
             }
             Telemetry::Health(health) if *topic == Topic::Health => {
                 if let Some(metrics) = &health.metrics {
-                    series.healths.push(Vital {
+                    series.healths.push(HealthPoint {
                         at_s,
-                        s: series.poses.last().and_then(|spot| Some(spot.track?[0])),
+                        s: series.poses.last().and_then(|point| Some(point.track?[0])),
                         state: health.state,
                         alignment: f64::from(metrics.alignment),
                         slip: f64::from(metrics.slip),
@@ -240,13 +239,13 @@ impl Collector {
         let mut cars = Vec::new();
         for (name, mut series) in self.series {
             let car = self.fleet.car(&name)?;
-            // The recorder's own stream has every pose; what came live may have holes.
+            // The full-rate stream has every pose; the live one may have gaps.
             if let Some(full) = self.full_rate.remove(&name)
                 && full.len() > series.poses.len()
             {
                 series.poses = full;
             }
-            series.poses.sort_by_key(|spot| spot.sensor);
+            series.poses.sort_by_key(|point| point.sensor);
             series.truths.sort_by_key(|(at, _)| *at);
             series.map = car.map.as_ref().map(|(map, _)| map.clone());
             series.length = car.lap_length();
@@ -325,8 +324,8 @@ fn table(laps: &[Lap]) -> Vec<TableRow> {
     sets.into_iter().filter_map(row).collect()
 }
 
-/// Each state lasts from a health message to the next, but not over a pause.
-fn states(healths: &[Vital]) -> BTreeMap<String, f64> {
+/// Share of each state. A state lasts from one health message to the next, but not over a pause.
+fn states(healths: &[HealthPoint]) -> BTreeMap<String, f64> {
     const PAUSE_S: f64 = 1.0;
     let mut lasted: BTreeMap<String, f64> = BTreeMap::new();
     for pair in healths.windows(2) {
@@ -342,7 +341,7 @@ fn states(healths: &[Vital]) -> BTreeMap<String, f64> {
         .collect()
 }
 
-/// The truth at a moment, between two samples by the straight line; None further than 50 ms from either.
+/// The truth at a time, interpolated linearly; None if a sample is further than 50 ms away.
 fn truth_at(truths: &[(i64, Pose2)], at: i64) -> Option<Pose2> {
     const NEAR: i64 = 50_000_000;
     let after = truths.partition_point(|(t, _)| *t < at);
@@ -359,17 +358,17 @@ fn truth_at(truths: &[(i64, Pose2)], at: i64) -> Option<Pose2> {
     })
 }
 
-/// `[distance, along, across, heading]` of a pose less the truth [m, m, m, rad].
-fn error_of(spot: &Spot, truths: &[(i64, Pose2)]) -> Option<[f64; 4]> {
-    let truth = truth_at(truths, spot.sensor)?;
-    let (dx, dy) = (spot.pose.x - truth.x, spot.pose.y - truth.y);
+/// `[distance, along, across, heading]` of a pose minus the truth \[m, m, m, rad\].
+fn error_of(point: &PosePoint, truths: &[(i64, Pose2)]) -> Option<[f64; 4]> {
+    let truth = truth_at(truths, point.sensor)?;
+    let (dx, dy) = (point.pose.x - truth.x, point.pose.y - truth.y);
     let (sin, cos) = truth.heading.sin_cos();
-    let heading = maps::wrap_angle(spot.pose.heading - truth.heading);
+    let heading = maps::wrap_angle(point.pose.heading - truth.heading);
     Some([dx.hypot(dy), cos * dx + sin * dy, cos * dy - sin * dx, heading])
 }
 
-fn true_error(poses: &[Spot], truths: &[(i64, Pose2)]) -> Option<TrueError> {
-    let errors: Vec<_> = poses.iter().filter_map(|spot| error_of(spot, truths)).collect();
+fn true_error(poses: &[PosePoint], truths: &[(i64, Pose2)]) -> Option<TrueError> {
+    let errors: Vec<_> = poses.iter().filter_map(|point| error_of(point, truths)).collect();
     let rms = |i: usize| (errors.iter().map(|e| e[i].powi(2)).sum::<f64>() / errors.len() as f64).sqrt();
     (!errors.is_empty()).then(|| TrueError {
         poses: errors.len(),
@@ -427,25 +426,25 @@ mod tests {
             heading: quarter,
         };
         let truths = [(0, at(0.0, 0.0)), (20_000_000, at(0.0, 0.2))];
-        let spot = |sensor, x, y| Spot {
+        let point = |sensor, x, y| PosePoint {
             sensor,
             pose: at(x, y),
             track: None,
         };
         // Half way the truth is at y = 0.1; the pose is 0.03 behind it and 0.04 to its right.
-        let error = true_error(&[spot(10_000_000, 0.04, 0.07)], &truths).expect("compared");
+        let error = true_error(&[point(10_000_000, 0.04, 0.07)], &truths).expect("compared");
         assert!((error.along_m - 0.03).abs() < 1e-9 && (error.across_m - 0.04).abs() < 1e-9);
         assert!((error.rmse_m - 0.05).abs() < 1e-9 && error.heading_rad.abs() < 1e-9);
         assert_eq!(
-            true_error(&[spot(500_000_000, 0.0, 0.0)], &truths),
+            true_error(&[point(500_000_000, 0.0, 0.0)], &truths),
             None,
             "the truth had ended"
         );
     }
 
     #[test]
-    fn a_state_lasts_until_the_next_message_and_a_pause_is_nobodys() {
-        let vital = |at_s, state| Vital {
+    fn a_state_lasts_until_the_next_message_but_not_over_a_pause() {
+        let point = |at_s, state| HealthPoint {
             at_s,
             s: None,
             state,
@@ -453,10 +452,10 @@ mod tests {
             slip: 0.0,
         };
         let shares = states(&[
-            vital(0.0, State::Localized),
-            vital(0.3, State::Lost),
-            vital(0.4, State::Localized),
-            vital(60.0, State::Localized),
+            point(0.0, State::Localized),
+            point(0.3, State::Lost),
+            point(0.4, State::Localized),
+            point(60.0, State::Localized),
         ]);
         assert!((shares["LOCALIZED"] - 0.75).abs() < 1e-9 && (shares["LOST"] - 0.25).abs() < 1e-9);
     }

@@ -1,9 +1,9 @@
-//! Plots as SVG text, drawn with classes so that the page's style colours them.
+//! Plots as SVG text, with CSS classes for the colours.
 
-/// Size of a plot [px].
+/// Size of a plot \[px\].
 pub(super) const WIDTH: f64 = 640.0;
 const HEIGHT: f64 = 180.0;
-/// Room for the axes' numbers [px].
+/// Margin for the numbers of the axes \[px\].
 const LEFT: f64 = 46.0;
 const BELOW: f64 = 28.0;
 const ABOVE: f64 = 8.0;
@@ -16,7 +16,7 @@ pub(super) struct Plot {
 }
 
 impl Plot {
-    /// Axes from `x[0]` to `x[1]` and `y[0]` to `y[1]`, with their names.
+    /// A plot with the ranges `x` and `y` and the names of the axes.
     pub(super) fn new(x: [f64; 2], y: [f64; 2], names: [&str; 2]) -> Self {
         let widen = |[from, to]: [f64; 2]| if to > from { [from, to] } else { [from, from + 1.0] };
         let mut plot = Self {
@@ -54,7 +54,7 @@ impl Plot {
         plot
     }
 
-    /// A line through points; a point that is not finite is a hole.
+    /// A line through points. It is interrupted at points that are not finite.
     pub(super) fn line(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
         let mut path = String::new();
         let mut pen = 'M';
@@ -70,7 +70,7 @@ impl Plot {
         self.write(&format!(r#"<path class="{class}" d="{path}"/>"#));
     }
 
-    /// Bars from the axis to each point, `width` wide on the x axis, with what they say when pointed at.
+    /// Bars of a `width` on the x axis from the axis to each point, with a tooltip.
     pub(super) fn bars(
         &mut self,
         width: f64,
@@ -88,7 +88,7 @@ impl Plot {
         }
     }
 
-    /// A level across the plot.
+    /// A horizontal line across the plot.
     pub(super) fn limit(&mut self, y: f64) {
         if (self.y[0]..=self.y[1]).contains(&y) {
             let [x0, y] = self.place([self.x[0], y]);
@@ -103,7 +103,7 @@ impl Plot {
         self.text
     }
 
-    /// Where a point is [px]; outside the axes it is drawn on the edge.
+    /// Position of a point \[px\]; a point outside the axes is moved to the edge.
     fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let share = |v: f64, [from, to]: [f64; 2]| ((v - from) / (to - from)).clamp(0.0, 1.0);
         [
@@ -117,7 +117,7 @@ impl Plot {
     }
 }
 
-/// Round numbers between two, about five of them.
+/// About five round numbers in a range.
 fn ticks([from, to]: [f64; 2]) -> Vec<f64> {
     let raw = (to - from) / 5.0;
     let power = 10_f64.powf(raw.log10().floor());
@@ -131,13 +131,13 @@ fn ticks([from, to]: [f64; 2]) -> Vec<f64> {
     (first..=last.min(first + 20)).map(|i| i as f64 * step).collect()
 }
 
-/// A number without digits that say nothing.
+/// A number without needless digits.
 pub(super) fn number(value: f64) -> String {
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
-/// Text that means itself in HTML and SVG.
+/// Escapes a text for HTML and SVG.
 pub(super) fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")

@@ -1,16 +1,16 @@
-//! What each event becomes in Rerun.
+//! Converts events to Rerun's data.
 //!
 //! ```text
 //! track/map                  the grid, once
-//! track/CAR/body             where it is, with its outline and its speed; 20 times a second at most
-//! track/CAR/trail            about the last twenty seconds, once a second
+//! track/CAR/body             pose, outline and speed; 20 times a second at most
+//! track/CAR/trail            positions of about the last twenty seconds, once a second
 //! track/CAR/particles, scan  5 times a second at most
 //! lanes/CAR/state, set       in the page's colours
 //! plots/CURVE/CAR            see `layout::CURVES`
-//! events/CAR                 what was said
+//! events/CAR                 the log
 //! ```
 //!
-//! Everything has one time, `time`: that of the sensors where a message has one.
+//! The only timeline is `time`: the sensors' time, if a message has one.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
@@ -27,26 +27,26 @@ use crate::event::{Delivery, EventPayload, FleetEvent};
 type Logged = Result<(), RecordingStreamError>;
 
 const SECOND: i64 = 1_000_000_000;
-/// Points of a trail: about twenty seconds.
+/// Number of points of a trail: about twenty seconds.
 const TRAIL: usize = 400;
-/// From one drawing of a trail to the next [ns]: each time it is logged whole.
+/// Period at which a trail is logged \[ns\]. It is logged whole each time.
 const TRAIL_EVERY: i64 = SECOND;
 
-/// Turns events into what Rerun draws.
+/// Logs events to Rerun.
 pub(super) struct EventLog {
     stream: RecordingStream,
     cars: HashMap<CarName, Drawn>,
     layout: Layout,
 }
 
-/// What one car has had drawn.
+/// What is logged of one car.
 struct Drawn {
     colour: Color,
-    /// When a message of this kind was last drawn [unix ns].
+    /// When a message of this topic was last logged \[unix ns\].
     last: HashMap<Topic, i64>,
     trail: VecDeque<[f32; 3]>,
     trail_at: i64,
-    /// It sends live; what the recorder gets besides is the same once more.
+    /// True when live messages arrive. The full-rate ones repeat them.
     live: bool,
     sets: HashSet<String>,
 }
@@ -60,7 +60,8 @@ impl EventLog {
         }
     }
 
-    pub(super) fn take(&mut self, event: &FleetEvent) -> Logged {
+    /// Logs an event to Rerun.
+    pub(super) fn add(&mut self, event: &FleetEvent) -> Logged {
         let car = &event.car;
         if !self.cars.contains_key(car) {
             self.introduce(car)?;
@@ -101,7 +102,7 @@ impl EventLog {
         }
     }
 
-    /// Nothing more will come: sends the layout if it still waits for something.
+    /// Sends the layout if it still waits, because no more events follow.
     pub(super) fn finish(mut self) -> Logged {
         match self.layout.settle() {
             Some(layout) => layout.send(&self.stream),
@@ -109,7 +110,7 @@ impl EventLog {
         }
     }
 
-    /// What stays the same about a car.
+    /// Logs what does not change about a car.
     fn introduce(&mut self, car: &CarName) -> Logged {
         let colour = colour_of(self.cars.len());
         for (what, _) in CURVES {
@@ -141,7 +142,7 @@ impl EventLog {
 }
 
 impl Drawn {
-    /// True when enough time has passed since the last message of this kind that was drawn.
+    /// True when enough time has passed since the last logged message of this topic.
     fn due(&mut self, topic: Topic, at: i64) -> bool {
         let apart = match topic {
             Topic::Pose => SECOND / 20,
@@ -151,7 +152,7 @@ impl Drawn {
             _ => return false,
         };
         let last = self.last.entry(topic).or_insert(i64::MIN);
-        // A tenth less, so that a rate just at the limit is not halved. Time runs back when a replay jumps.
+        // A tenth less, so that a rate just at the limit is not halved. In a replay, time can jump back.
         let due =
             apart == 0 || at.saturating_sub(*last) >= apart - apart / 10 || last.saturating_sub(at) > SECOND;
         if due {
@@ -200,7 +201,7 @@ fn draw_pose(stream: &RecordingStream, car: &CarName, drawn: &mut Drawn, time: i
     if drawn.trail.len() == TRAIL {
         drawn.trail.pop_front();
     }
-    // Where the estimate jumps, nobody has driven.
+    // A jump of the estimate is not part of the path.
     if drawn
         .trail
         .back()
@@ -209,7 +210,7 @@ fn draw_pose(stream: &RecordingStream, car: &CarName, drawn: &mut Drawn, time: i
         drawn.trail.clear();
     }
     drawn.trail.push_back(at);
-    // Time runs back when a replay jumps.
+    // In a replay, time can jump back.
     if time.saturating_sub(drawn.trail_at) >= TRAIL_EVERY || time < drawn.trail_at {
         drawn.trail_at = time;
         let line = LineStrips3D::new([drawn.trail.iter().copied().collect::<Vec<_>>()])
@@ -244,7 +245,7 @@ fn draw_health(stream: &RecordingStream, car: &CarName, health: &Health) -> Logg
     Ok(())
 }
 
-/// Every set that comes up gets a colour, the same for all cars.
+/// The colour of a set, the same for all cars.
 fn draw_set(stream: &RecordingStream, car: &CarName, drawn: &mut Drawn, params: &Params) -> Logged {
     let delivery = format!("lanes/{car}/set");
     let name = params.set.name.as_str();
@@ -287,7 +288,7 @@ fn end_points(scan: &ScanView) -> Points3D {
         .with_colors(colours)
 }
 
-/// The grid; its first row is its lowest, an image's its highest.
+/// The grid. Its first row is the lowest; that of an image is the highest.
 fn grid(map: &MapReply) -> GridMap {
     let cells = map.occupancy();
     let rows: Vec<_> = cells.chunks(map.width.max(1) as usize).rev().collect();
@@ -302,7 +303,7 @@ fn grid(map: &MapReply) -> GridMap {
         .with_colormap(rerun::components::Colormap::RvizMap)
 }
 
-/// A turn about the vertical [rad].
+/// A rotation about the vertical axis \[rad\].
 fn turned(heading: f64) -> Quaternion {
     let (sin, cos) = (heading / 2.0).sin_cos();
     Quaternion::from_xyzw([0.0, 0.0, sin as f32, cos as f32])
@@ -319,7 +320,7 @@ const STATES: [(&str, [u8; 3]); 7] = [
     ("STALE", [200, 60, 60]),
 ];
 
-/// A car's own colour, by its place in the order of appearance: the page's, where all cars are there from the begin.
+/// A car's colour, by its order of appearance. It is that of the page if all cars are present from the start.
 fn colour_of(index: usize) -> Color {
     const COLOURS: [[u8; 3]; 10] = [
         [90, 169, 255],
@@ -394,13 +395,13 @@ mod tests {
         })
     }
 
-    /// Rows of each entity that has a time, and how many times there are.
+    /// Number of rows of each entity with a time, and number of times.
     fn rows(events: impl IntoIterator<Item = FleetEvent>) -> BTreeMap<String, usize> {
         let (stream, stored) = RecordingStreamBuilder::new("pitwall").memory().expect("a stream");
         stream.set_log_time_enabled(false);
         let mut log = EventLog::new(stream.clone());
         for event in events {
-            log.take(&event).expect("drawn");
+            log.add(&event).expect("drawn");
         }
         log.finish().expect("ended");
         stream.flush_blocking().expect("flushed");

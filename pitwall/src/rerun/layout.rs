@@ -1,4 +1,4 @@
-//! What the Rerun viewer opens with: the track from above, lanes for state and set, plots, and what happened.
+//! The initial layout of the Rerun viewer: the track from above, lanes for state and set, plots, and the log.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use rerun::{Points3D, RecordingStream, RecordingStreamBuilder, RecordingStreamEr
 
 use crate::event::{EventPayload, FleetEvent};
 
-/// What is plotted of each car, with its title.
+/// The curves of each car, with their titles.
 pub(super) const CURVES: [(&str, &str); 6] = [
     ("alignment", "alignment"),
     ("slip", "slip"),
@@ -30,24 +30,23 @@ pub(super) fn curve(what: &str, car: &CarName) -> String {
     format!("plots/{what}/{car}")
 }
 
-/// Waits until the layout can be made. It is sent once: sent again, it would undo what the person at the viewer has
-/// moved.
+/// Waits until the layout can be made. It is sent once, because a second one would undo the changes of the user.
 #[derive(Default)]
 pub(super) struct Layout {
     map: Option<Arc<MapReply>>,
     cars: BTreeSet<CarName>,
-    /// When the first car was heard of [unix ns].
+    /// When the first car appeared \[unix ns\].
     since: Option<i64>,
     sent: bool,
 }
 
 impl Layout {
-    /// Cars that are there show up, and one's map is fetched, within this time of the first one [ns].
+    /// Time after the first car within which the others appear and a map is fetched \[ns\].
     const WAIT: i64 = 1_500_000_000;
-    /// So long is waited for a map [ns].
+    /// Maximum time to wait for a map \[ns\].
     const MAPLESS: i64 = 10_000_000_000;
 
-    /// Takes in an event; gives the layout when it is time.
+    /// Adds an event; returns the layout when it is due.
     pub(super) fn learn(&mut self, event: &FleetEvent) -> Option<Plan> {
         if self.sent {
             return None;
@@ -63,7 +62,7 @@ impl Layout {
         None
     }
 
-    /// The layout as far as it is known, if it was not given before.
+    /// The layout as far as it is known, if it was not returned before.
     pub(super) fn settle(&mut self) -> Option<Plan> {
         if self.sent || self.cars.is_empty() {
             return None;
@@ -76,7 +75,7 @@ impl Layout {
     }
 }
 
-/// For what the layout is.
+/// The content of the layout.
 pub(super) struct Plan {
     map: Option<Arc<MapReply>>,
     cars: Vec<CarName>,
@@ -85,8 +84,8 @@ pub(super) struct Plan {
 impl Plan {
     /// Sends the layout.
     pub(super) fn send(&self, stream: &RecordingStream) -> Result<(), RecordingStreamError> {
-        // It goes through memory: where its 3-D view ended up must be known before a camera can be put there,
-        // because a view has no setter for it.
+        // It goes through memory, because the path of its 3-D view is needed for the camera and the view has no setter for
+        // that.
         let (scratch, drawn) = RecordingStreamBuilder::new("pitwall").memory()?;
         let activation = BlueprintActivation {
             make_active: true,
@@ -108,7 +107,7 @@ impl Plan {
             }
             _ => Vec::new(),
         };
-        // The store is announced by the layout's own first message, and activated by its last.
+        // The first message of the layout announces its store, the last one activates it.
         let activate = messages.pop();
         let camera = camera
             .into_iter()
@@ -120,7 +119,7 @@ impl Plan {
     }
 }
 
-/// The path of the view that has defaults: only the track does, so that it can be told from the others.
+/// The path of the view with defaults, which only the track has.
 fn view_with_defaults(message: &LogMsg) -> Option<String> {
     let LogMsg::ArrowMsg(_, arrow) = message else {
         return None;
@@ -130,7 +129,7 @@ fn view_with_defaults(message: &LogMsg) -> Option<String> {
     Some(path.strip_suffix("/defaults")?.to_owned())
 }
 
-/// A camera over the middle of the raceline, or of the map, high enough to see all of it.
+/// A camera above the middle of the raceline, or else of the map, high enough to see all of it.
 fn from_above(map: &MapReply) -> EyeControls3D {
     let points: Vec<[f64; 2]> = if let Some(line) = &map.raceline {
         let point = |&[x, y]: &[f32; 2]| [f64::from(x), f64::from(y)];
@@ -311,7 +310,7 @@ mod tests {
         // The middle of the raceline.
         assert!(camera[0].1.contains("5.0"), "{}", camera[0].1);
 
-        // A viewer reads stars only at the end of a path: anything else finds nothing, without a word.
+        // A viewer accepts wildcards only at the end of a path. Elsewhere they match nothing, without an error.
         let queries: Vec<String> = chunks
             .iter()
             .filter(|(path, _)| path.ends_with("/ViewContents"))

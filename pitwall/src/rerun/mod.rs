@@ -1,7 +1,7 @@
-//! The same events for the Rerun viewer: history and depth beside the page.
+//! Logs the events to the Rerun viewer, for history and details.
 //!
-//! What the engineer acts on is on the page; this is to look back and into things. Data is decimated, the server's
-//! memory is capped, and nothing waits for a viewer: what does not fit into the queue is left out.
+//! Data is decimated and the memory of the server is limited. Nothing waits for a viewer: events that do not fit into the
+//! queue are dropped.
 
 mod event_log;
 mod layout;
@@ -25,27 +25,27 @@ use event_log::EventLog;
 /// Where the data goes.
 #[derive(Debug, Clone)]
 pub enum RerunOutlet {
-    /// Into a file.
+    /// A file.
     Save(PathBuf),
-    /// To viewers that dial this port on loopback.
+    /// Viewers that connect to this port on loopback.
     Serve(u16),
-    /// To a viewer that listens, as `rerun+http://127.0.0.1:9876/proxy`.
+    /// A running viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
     Connect(String),
 }
 
-/// Data on its way to Rerun. Dropping it ends it without waiting for anything.
+/// A running log to Rerun. Dropping it stops it without waiting.
 pub struct RerunView {
-    /// Says that no more events are wanted, by being dropped.
+    /// Dropped to stop the thread.
     closing: Sender<()>,
-    /// Hears that everything has been handed over, by being disconnected.
+    /// Disconnected when the thread has sent everything.
     closed: Receiver<()>,
     patience: Duration,
 }
 
-/// Why there is no such view.
+/// Why logging to Rerun cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum RerunError {
-    /// Rerun refuses.
+    /// An error of Rerun.
     #[error("rerun: {0}")]
     Stream(String),
     /// The file cannot be written.
@@ -64,8 +64,8 @@ pub enum RerunError {
         /// What is wrong.
         reason: String,
     },
-    /// The system gives no thread.
-    #[error("no thread for rerun: {0}")]
+    /// The thread cannot be started.
+    #[error("cannot start the thread for rerun: {0}")]
     Thread(std::io::Error),
 }
 
@@ -76,19 +76,19 @@ impl From<RecordingStreamError> for RerunError {
 }
 
 impl RerunView {
-    /// HealthHistory that the server keeps for viewers that come later [bytes].
+    /// Memory for the history that later viewers get \[bytes\].
     const MEMORY: u64 = 256 * 1024 * 1024;
-    /// Rows wait this long for others of their kind: five times fewer chunks than a live stream has by default, which
-    /// is what a viewer in a browser spends its time on.
+    /// Time for which rows are collected into a chunk. It gives five times fewer chunks than the default, and chunks are what
+    /// costs a viewer in a browser its time.
     const BATCH: Duration = Duration::from_millis(200);
 
-    /// Begins to log `events`. [`RerunOutlet::Serve`] needs a tokio runtime.
+    /// Starts to log `events`. [`RerunOutlet::Serve`] needs a tokio runtime.
     pub fn start(events: Receiver<Arc<FleetEvent>>, outlet: &RerunOutlet) -> Result<Self, RerunError> {
         let builder = RecordingStreamBuilder::new("pitwall").batcher_config(ChunkBatcherConfig {
             flush_tick: Self::BATCH,
             ..ChunkBatcherConfig::DEFAULT
         });
-        // A file is to be whole; whoever does not read at the other end of a link is not waited for.
+        // A file must be complete. A viewer that does not read is not waited for.
         let mut patience = Duration::from_secs(1);
         let stream = match outlet {
             RerunOutlet::Connect(url) => builder.connect_grpc_opts(url.as_str())?,
@@ -132,18 +132,18 @@ impl RerunView {
         })
     }
 
-    /// Hands over what has come so far and ends. Gives up after a while, a second where it goes to a viewer.
+    /// Sends the remaining events and ends. Gives up after a timeout, which is a second for a viewer.
     pub fn finish(self) {
         drop(self.closing);
         if let Err(crossbeam_channel::RecvTimeoutError::Timeout) =
             self.closed.recv_timeout(self.patience + Duration::from_secs(1))
         {
-            tracing::warn!("rerun does not take the last of the data");
+            tracing::warn!("rerun does not accept the last data in time");
         }
     }
 }
 
-/// Logs events until no more come or are wanted.
+/// Logs events until the sender is gone or the view is closed.
 fn run(
     stream: &RecordingStream,
     events: &Receiver<Arc<FleetEvent>>,
@@ -151,21 +151,21 @@ fn run(
     patience: Duration,
 ) {
     let mut log = EventLog::new(stream.clone());
-    let mut take = |event: &FleetEvent| {
-        log.take(event)
+    let mut add = |event: &FleetEvent| {
+        log.add(event)
             .inspect_err(|error| tracing::warn!(%error, "rerun"))
             .is_ok()
     };
     loop {
         select! {
             recv(events) -> event => match event {
-                Ok(event) if take(&event) => {}
+                Ok(event) if add(&event) => {}
                 Ok(_) => return,
                 Err(_) => break,
             },
             recv(wanted) -> _ => {
-                // No longer than what had come by now.
-                events.try_iter().take(events.len()).all(|event| take(&event));
+                // Only the events that have arrived by now.
+                events.try_iter().take(events.len()).all(|event| add(&event));
                 break;
             }
         }
@@ -174,7 +174,7 @@ fn run(
         tracing::warn!(%error, "rerun");
     }
     match stream.flush_with_timeout(patience) {
-        // Closes a file with its index.
+        // Completes a file with its index.
         Ok(()) => stream.finalize_deferred_sinks(),
         Err(error) => tracing::warn!(%error, "rerun"),
     }

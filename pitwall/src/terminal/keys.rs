@@ -1,20 +1,20 @@
-//! What the keys of the full-screen view do. Pure: a key goes in, what is to be done comes out.
+//! Key bindings of the full-screen view. Pure: maps a key to an action.
 
 use protocol::{Action, CarName, ParamsAction, RelocalizeAction};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
-/// What the person at the terminal has chosen.
+/// The current selection.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Selection {
-    /// The selected car, by its place in the list.
+    /// Index of the selected car.
     pub(super) car: usize,
-    /// Open while a set is being chosen: which one the cursor is on.
+    /// Index of the set under the cursor while the list of sets is open.
     pub(super) sets: Option<usize>,
-    /// The help is open.
+    /// True while the help is open.
     pub(super) help: bool,
 }
 
-/// What there is to choose from.
+/// The choices.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Choices<'a> {
     pub(super) cars: &'a [CarName],
@@ -22,21 +22,21 @@ pub(super) struct Choices<'a> {
     pub(super) sets: &'a [String],
 }
 
-/// What a key asks for.
+/// The action of a key.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum KeyAction {
     Nothing,
     Quit,
     Acknowledge,
-    /// Something for the selected car to do.
+    /// A command for the selected car.
     Do(Action),
 }
 
 impl Selection {
-    /// Sets chosen with a capital letter fall back after this time unless confirmed [ms].
+    /// Sets chosen with a capital letter fall back after this time unless confirmed \[ms\].
     pub(super) const TRIAL_MS: u32 = 60_000;
 
-    /// Takes a key.
+    /// Handles a key.
     pub(super) fn press(&mut self, key: KeyEvent, choices: Choices<'_>) -> KeyAction {
         self.car = self.car.min(choices.cars.len().saturating_sub(1));
         if key.code == KeyCode::Char('c') && key.modifiers.contains(KeyModifiers::CONTROL) {
@@ -60,7 +60,7 @@ impl Selection {
                 revert_after_ms,
             })))
         };
-        let wish = match key {
+        let action = match key {
             KeyCode::Down | KeyCode::Char('j') => {
                 self.sets = Some((at + 1).min(sets.len().saturating_sub(1)));
                 return KeyAction::Nothing;
@@ -78,7 +78,7 @@ impl Selection {
             _ => None,
         };
         self.sets = None;
-        wish.unwrap_or(KeyAction::Nothing)
+        action.unwrap_or(KeyAction::Nothing)
     }
 
     fn act(&mut self, key: KeyCode, choices: Choices<'_>) -> KeyAction {
@@ -97,7 +97,7 @@ impl Selection {
             KeyCode::Char('?') => self.help = true,
             KeyCode::Char('a') => return KeyAction::Acknowledge,
             KeyCode::Char('q') | KeyCode::Esc => return KeyAction::Quit,
-            // With Shift, for these take effect at once.
+            // With Shift, because these take effect at once.
             KeyCode::Char('C') => return KeyAction::Do(Action::Params(ParamsAction::Confirm)),
             KeyCode::Char('R') => return KeyAction::Do(Action::Params(ParamsAction::Revert)),
             KeyCode::Char('W') => return KeyAction::Do(Action::Params(ParamsAction::Shadow { name: None })),

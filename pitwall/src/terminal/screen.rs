@@ -1,4 +1,4 @@
-//! The full-screen view, for a terminal over ssh: all cars, one of them whole, what happened, and the switch.
+//! The full-screen view for a terminal: all cars, one of them in detail, the log, and the parameter sets.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -16,7 +16,7 @@ use ratatui::{DefaultTerminal, Frame};
 use super::keys::{Choices, KeyAction, Selection};
 use super::text;
 
-/// What is on the screen.
+/// The content of the screen.
 #[derive(Default)]
 struct Shown {
     cars: Vec<CarView>,
@@ -25,18 +25,18 @@ struct Shown {
     log: Vec<LogEntry>,
     alarms: usize,
     selection: Selection,
-    /// What became of the last command, and whether it was done; None while it is under way.
+    /// Outcome of the last command, and whether it succeeded; None while it runs.
     answer: Option<(Option<bool>, String)>,
 }
 
-/// Shows the cars until somebody presses q.
+/// Shows the cars until the user presses q.
 pub(crate) async fn run(
     service: Arc<FleetService>,
     car: Option<CarName>,
     operator: String,
     period: Duration,
 ) -> anyhow::Result<()> {
-    // Reading keys blocks, and the terminal must be put back whatever happens: a thread of its own that owns it.
+    // Reading keys blocks, and the terminal must be restored in any case. So a separate thread owns it.
     let runtime = tokio::runtime::Handle::current();
     let leave = Arc::new(std::sync::atomic::AtomicBool::new(false));
     let stop = Guard(leave.clone());
@@ -51,7 +51,7 @@ pub(crate) async fn run(
     outcome
 }
 
-/// Tells the thread to put the terminal back when the view is dropped.
+/// Makes the thread restore the terminal when the view is dropped.
 struct Guard(Arc<std::sync::atomic::AtomicBool>);
 
 impl Drop for Guard {
@@ -73,7 +73,7 @@ fn loop_until(
     let mut wanted = car;
     let (answers, answered): (Sender<_>, Receiver<_>) = channel();
     while !leave.load(std::sync::atomic::Ordering::Relaxed) {
-        shown.look(service);
+        shown.update(service);
         if let Some(at) = wanted
             .as_ref()
             .and_then(|name| shown.cars.iter().position(|c| c.car == *name))
@@ -98,9 +98,9 @@ fn loop_until(
             KeyAction::Acknowledge => service.fleet().acknowledge(unix_now(), operator),
             KeyAction::Do(action) => {
                 if let Some(view) = shown.cars.get(shown.selection.car) {
-                    shown.answer = Some((None, format!("{}: asking the car", view.car)));
+                    shown.answer = Some((None, format!("{}: waiting for the car", view.car)));
                     let revision = view.set.as_ref().map(|set| set.revision);
-                    let order = give(
+                    let command = send_command(
                         service.clone(),
                         view.car.clone(),
                         operator.to_owned(),
@@ -108,7 +108,7 @@ fn loop_until(
                         action,
                     );
                     let answers = answers.clone();
-                    runtime.spawn(async move { drop(answers.send(order.await)) });
+                    runtime.spawn(async move { drop(answers.send(command.await)) });
                 }
             }
         }
@@ -116,15 +116,15 @@ fn loop_until(
     Ok(())
 }
 
-/// Gives a command, and says what became of it.
-async fn give(
+/// Sends a command and returns a text about its outcome.
+async fn send_command(
     service: Arc<FleetService>,
     car: CarName,
     operator: String,
     revision: Option<u64>,
     action: Action,
 ) -> (Option<bool>, String) {
-    // A change of the set is meant for the one that is on the screen.
+    // A change of the set refers to the revision on the screen.
     let expected = matches!(action, Action::Params(_)).then_some(revision).flatten();
     match service.client().command(&car, &operator, expected, action).await {
         Ok(verdict) => (Some(verdict.exit_code() == 0), verdict.text(&car)),
@@ -135,14 +135,14 @@ async fn give(
 impl Shown {
     const LOG: usize = 200;
 
-    /// Takes in how things are.
-    fn look(&mut self, service: &FleetService) {
+    /// Updates what is shown.
+    fn update(&mut self, service: &FleetService) {
         let fleet = service.fleet();
         self.cars = fleet.view(unix_now());
         self.alarms = fleet.log().alarms();
         let from = fleet.log().last().saturating_sub(Self::LOG as u64);
         self.log = fleet.log().since(from).cloned().collect();
-        // What came late stands where it belongs.
+        // Late entries are sorted in by time.
         self.log.sort_by_key(|entry| entry.at);
         let selected = self
             .cars
@@ -166,7 +166,7 @@ impl Shown {
 
     fn draw(&self, frame: &mut Frame<'_>) {
         let rows = self.cars.len().max(1) as u16 + 3;
-        // Where there is little room, all cars and their states stay; events go first.
+        // On a small screen, the cars and their states stay and the log is hidden first.
         let height = frame.area().height;
         let cars = rows.min(height / 2);
         let log = (height / 4).min(height.saturating_sub(cars + 9));
@@ -189,7 +189,7 @@ impl Shown {
     }
 
     fn draw_cars(&self, frame: &mut Frame<'_>, area: Rect) {
-        // Where there is little room, why a car is as it is counts for more than numbers that stand below.
+        // On a narrow screen, the causes matter more than numbers that are shown below.
         let wide = area.width >= WIDE;
         let keep = |column: usize| wide || [0, 1, 2, 4, 6, 8].contains(&column);
         let columns = |cells: [Line<'static>; 9]| {
@@ -281,7 +281,7 @@ impl Shown {
             let comparison = text::comparison(shadow);
             lines.extend(wrapped(&comparison, room, 8).into_iter().map(Line::from));
         }
-        // The curve takes only what the words leave.
+        // The curve gets the width that the text leaves.
         let chart = if (area.height as usize) < lines.len() + 5 {
             0
         } else {
@@ -405,10 +405,10 @@ const HELP: [&str; 11] = [
     "any key closes this",
 ];
 
-/// The table has all its columns where it is so wide.
+/// Width from which on the table has all columns.
 const WIDE: u16 = 100;
 
-/// A line in pieces of at most `width`, between fields where that is possible, all but the first behind an indent.
+/// Wraps a line to `width`, between fields if possible. All lines but the first are indented.
 fn wrapped(line: &str, width: usize, indent: usize) -> Vec<String> {
     let mut lines = Vec::new();
     let mut rest = line.to_owned();
@@ -417,7 +417,7 @@ fn wrapped(line: &str, width: usize, indent: usize) -> Vec<String> {
             lines.push(rest);
             return lines;
         };
-        // Not within the indent, or it would go on for ever.
+        // Not within the indent, which would never end.
         let from = rest
             .char_indices()
             .nth(indent + 1)
@@ -434,7 +434,7 @@ fn wrapped(line: &str, width: usize, indent: usize) -> Vec<String> {
     }
 }
 
-/// A box in the middle of the screen.
+/// A popup in the middle of the screen.
 fn popup(frame: &mut Frame<'_>, title: &str, lines: &[String]) {
     let width = lines.iter().map(|l| l.chars().count()).max().unwrap_or(0) as u16 + 4;
     let area = frame.area();
@@ -450,7 +450,7 @@ fn popup(frame: &mut Frame<'_>, title: &str, lines: &[String]) {
     frame.render_widget(Paragraph::new(lines.join("\n")).block(block), place);
 }
 
-/// Word and shape carry what the colour does.
+/// Word and shape have the same meaning as the colour.
 fn shape_of(state: &str) -> &'static str {
     match state {
         "LOCALIZED" => "●",

@@ -1,4 +1,4 @@
-//! What the page asks for and commands.
+//! Requests of the page.
 
 use axum::Json;
 use axum::extract::{Path, State};
@@ -27,12 +27,12 @@ pub(super) struct CommandRequest {
     car: CarName,
     operator: String,
     expected_revision: Option<u64>,
-    /// Given again, the command is the same one: it does nothing more.
+    /// A command that is sent again with the same id has no further effect.
     id: Option<CommandId>,
     action: Action,
 }
 
-/// Gives a car a command and says what became of it, with a text for the operator.
+/// Sends a command to a car and returns its outcome, with a text for the operator.
 pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandRequest>) -> Response {
     let CommandRequest {
         car,
@@ -69,7 +69,7 @@ pub(super) struct RecordRequest {
     operator: String,
 }
 
-/// Begins or ends a recording, in a file named by the time.
+/// Starts or stops a recording, in a file named by the time.
 pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordRequest>) -> Response {
     let RecordRequest { on, operator } = request;
     let Some(service) = &app.service else {
@@ -78,11 +78,11 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
     if operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
-    let say = |severity, text: String| {
+    let log = |severity, text: String| {
         let who = Some(operator.clone());
         app.bus
             .fleet()
-            .say(unix_now(), None, severity, "recorder", text, who);
+            .add_entry(unix_now(), None, severity, "recorder", text, who);
     };
     if on {
         let file = app
@@ -90,13 +90,13 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
             .join(format!("session-{}.mcap", unix_now() / 1_000_000_000));
         match service.start_recording(&file).await {
             Ok(()) => {
-                say(Severity::Info, format!("recording into {}", file.display()));
+                log(Severity::Info, format!("recording into {}", file.display()));
                 Json(json!({"recording": file.display().to_string()})).into_response()
             }
             Err(error) => (StatusCode::CONFLICT, error.to_string()).into_response(),
         }
     } else {
-        // It goes on when whoever asked does not wait for it.
+        // It continues when the page closes the connection.
         let service = service.clone();
         let ended = tokio::spawn(async move { service.stop_recording().await });
         match ended.await.ok().flatten() {
@@ -107,17 +107,17 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
                 } else {
                     Severity::Info
                 };
-                say(
+                log(
                     severity,
                     format!("recording ended: {messages} messages, {missing} missing"),
                 );
                 Json(json!({"missing": missing, "summary": summary})).into_response()
             }
             Some(Err(error)) => {
-                say(Severity::Critical, format!("recording failed: {error}"));
+                log(Severity::Critical, format!("recording failed: {error}"));
                 (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response()
             }
-            None => (StatusCode::CONFLICT, "no recording is going on").into_response(),
+            None => (StatusCode::CONFLICT, "nothing is being recorded").into_response(),
         }
     }
 }
@@ -153,7 +153,7 @@ pub(super) struct AcknowledgeRequest {
     operator: String,
 }
 
-/// Takes every alarm so far as seen, for all pages.
+/// Acknowledges every alarm so far, for all pages.
 pub(super) async fn acknowledge(State(app): State<App>, Json(request): Json<AcknowledgeRequest>) -> Response {
     if request.operator.len() > Command::MAX_OPERATOR {
         return too_long();
@@ -173,10 +173,10 @@ pub(super) struct ReplayRequest {
 /// Plays, pauses, changes the speed or jumps.
 pub(super) async fn replay(State(app): State<App>, Json(request): Json<ReplayRequest>) -> Response {
     let Some(replay) = &app.replay else {
-        return (StatusCode::CONFLICT, "the cars are live: nothing is replayed").into_response();
+        return (StatusCode::CONFLICT, "this is not a replay").into_response();
     };
     let ReplayRequest { playing, speed, at } = request;
-    match replay.steer(playing, speed, at) {
+    match replay.set_playback(playing, speed, at) {
         Ok(()) => Json(replay.view()).into_response(),
         Err(fault) => (StatusCode::BAD_REQUEST, fault).into_response(),
     }

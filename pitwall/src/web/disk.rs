@@ -1,13 +1,13 @@
-//! Room on the disk that recordings go to.
+//! Free space on the disk of the recordings.
 
 use std::path::Path;
 
 use sysinfo::Disks;
 
-/// Less than this is an alarm while a recording is going on [bytes]. Three cars fill it in about forty minutes.
+/// Less than this raises an alarm during a recording \[bytes\]. Three cars fill it in about forty minutes.
 pub(super) const SCARCE: u64 = 1_000_000_000;
 
-/// Free bytes where `folder` is; None where the system does not tell.
+/// Free bytes on the disk of `folder`; None if the system does not report them.
 pub(super) fn free(folder: &Path) -> Option<u64> {
     let folder = folder.canonicalize().ok()?;
     let disks = Disks::new_with_refreshed_list();

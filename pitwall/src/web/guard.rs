@@ -1,4 +1,4 @@
-//! Who may use the page.
+//! Access control of the page.
 
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
@@ -10,11 +10,11 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
-/// What the page may load and talk to: its own origin, nothing else.
+/// The page may only load from and connect to its own origin.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                       connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
-/// Lets in the page's own requests, and on a network only those who know the token.
+/// Accepts requests of the page's own origin, and on a network only with the token.
 pub(super) struct Guard {
     token: Option<String>,
 }
@@ -30,7 +30,7 @@ impl Guard {
         Self { token }
     }
 
-    /// The address to type into a browser.
+    /// The URL for a browser.
     pub(super) fn url(&self, address: SocketAddr) -> String {
         match &self.token {
             Some(token) => format!("http://{address}/?token={token}"),
@@ -46,7 +46,7 @@ impl Guard {
                 .and_then(|value: &HeaderValue| value.to_str().ok())
         };
         let host = text(header::HOST).ok_or("no Host")?;
-        // A name in place of an address may be anybody's who makes it point here.
+        // A host name is rejected, because anybody can make a name point here.
         let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
         if name != "localhost" && name.trim_matches(['[', ']']).parse::<IpAddr>().is_err() {
             return Err("use the address, not a name");
@@ -76,14 +76,14 @@ fn knows(headers: &HeaderMap, query: Option<&str>, token: &str) -> bool {
     in_cookie || query.is_some_and(|query| query.split('&').any(|part| part == parameter))
 }
 
-/// Checks a request, and adds to its answer what the browser should know.
+/// Checks a request, and adds the security headers to its response.
 pub(super) async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let mut response = match guard.admits(&request) {
         Ok(()) => next.run(request).await,
         Err(why) => return (StatusCode::FORBIDDEN, why).into_response(),
     };
     let headers = response.headers_mut();
-    // The viewer in the pane has a policy of its own.
+    // The viewer in the pane has its own policy.
     headers
         .entry(header::CONTENT_SECURITY_POLICY)
         .or_insert(HeaderValue::from_static(POLICY));

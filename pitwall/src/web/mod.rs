@@ -1,4 +1,4 @@
-//! The page: what the race engineer looks at.
+//! Serves the page of the race engineer.
 //!
 //! ```text
 //! GET  /               the page and its files, embedded in the program
@@ -6,20 +6,20 @@
 //!                      in: {"select": "car-1", "operator": "ana"}, {"drawn": 17}: ready for the next
 //! GET  /snapshot       one snapshot
 //! GET  /map/<car>      the map that a car localizes on
-//! POST /command        {car, operator, expected_revision, id, action}: waits for the car and says what became of it
+//! POST /command        {car, operator, expected_revision, id, action}: returns the outcome of the command
 //! POST /record         {"on": true|false, "operator"}
 //! POST /mark           {car, operator, text}
-//! POST /acknowledge    {operator}: every alarm so far has been seen
-//! POST /replay         {"playing": bool, "speed": n, "at": s}, each if it is to change; only in a replay
-//! POST /rerun          starts the Rerun viewer's data and says where the viewer is; it is served under /rerun/
+//! POST /acknowledge    {operator}: acknowledges every alarm so far
+//! POST /replay         {"playing": bool, "speed": n, "at": s}, each optional; only in a replay
+//! POST /rerun          starts the data stream for the Rerun viewer and returns its URL, under /rerun/
 //! ```
 //!
-//! Only pages of our own origin are served, and nothing on the page comes from anywhere else: the
-//! `Content-Security-Policy` says so to the browser. On any but a loopback address a token is asked for.
+//! Requests from other origins are rejected. The `Content-Security-Policy` keeps the page from loading anything from
+//! elsewhere. On an address other than loopback, a token is required.
 mod api;
 mod disk;
 mod guard;
-mod present;
+mod operators;
 #[cfg(feature = "rerun")]
 mod rerun;
 mod snapshot;
@@ -43,14 +43,14 @@ use crate::event_bus::EventBus;
 use crate::fleet_service::FleetService;
 use crate::replay::Replay;
 use guard::Guard;
-use present::Present;
+use operators::Operators;
 
-/// How the page is served.
+/// Where the page is served and recordings go.
 #[derive(Debug, Clone)]
 pub struct PageOptions {
-    /// Where.
+    /// The address.
     pub address: SocketAddr,
-    /// The folder that recordings go to.
+    /// The folder for recordings.
     pub recordings: PathBuf,
 }
 
@@ -63,41 +63,41 @@ impl Default for PageOptions {
     }
 }
 
-/// The page, being served.
+/// The running page server.
 pub struct Page {
     url: String,
     stop: watch::Sender<bool>,
     server: JoinHandle<std::io::Result<()>>,
 }
 
-/// What every request may need.
+/// State shared by all request handlers.
 #[derive(Clone)]
 struct App {
     bus: Arc<EventBus>,
-    /// The way to the cars; None in a replay.
+    /// The connection to the cars; None in a replay.
     service: Option<Arc<FleetService>>,
     /// None when live.
     replay: Option<Arc<Replay>>,
     recordings: Arc<PathBuf>,
     disk_free: watch::Receiver<Option<u64>>,
-    present: Present,
+    operators: Operators,
     stopping: watch::Receiver<bool>,
     #[cfg(feature = "rerun")]
     pane: Arc<tokio::sync::Mutex<Option<rerun::Pane>>>,
 }
 
 impl App {
-    /// The time that is shown [unix ns].
+    /// The time that is shown \[unix ns\].
     fn now(&self) -> i64 {
         self.replay.as_ref().map_or_else(unix_now, |replay| replay.now())
     }
 
-    /// Room on the recordings' disk [bytes].
+    /// Free space on the disk of the recordings \[bytes\].
     fn disk_free(&self) -> Option<u64> {
         *self.disk_free.borrow()
     }
 
-    /// Ends when the page is to stop.
+    /// Waits until the page is stopped.
     async fn stopped(&self) {
         drop(self.stopping.clone().wait_for(|stop| *stop).await);
     }
@@ -109,7 +109,7 @@ impl Page {
         Self::serve_from(service.bus().clone(), Some(service), None, options).await
     }
 
-    /// Serves a recording in place of cars.
+    /// Serves a replay.
     pub async fn serve_replay(replay: Arc<Replay>, options: PageOptions) -> std::io::Result<Self> {
         Self::serve_from(replay.bus().clone(), None, Some(replay), options).await
     }
@@ -127,7 +127,7 @@ impl Page {
         let (stop, stopping) = watch::channel(false);
         let (room, disk_free) = watch::channel(None);
         if service.is_some() {
-            tokio::spawn(look_at_disk(
+            tokio::spawn(watch_disk(
                 bus.clone(),
                 options.recordings.clone(),
                 room,
@@ -140,7 +140,7 @@ impl Page {
             replay,
             recordings: Arc::new(options.recordings),
             disk_free,
-            present: Present::default(),
+            operators: Operators::default(),
             stopping,
             #[cfg(feature = "rerun")]
             pane: Arc::default(),
@@ -172,7 +172,7 @@ impl Page {
         Ok(Self { url, stop, server })
     }
 
-    /// What to type into a browser.
+    /// The URL of the page, with the token if one is required.
     pub fn url(&self) -> &str {
         &self.url
     }
@@ -186,33 +186,33 @@ impl Page {
     }
 }
 
-/// Takes the room on the disk every few seconds, and says so when it runs short during a recording.
-async fn look_at_disk(
+/// Measures the free disk space every few seconds, and raises an alarm when it runs short during a recording.
+async fn watch_disk(
     bus: Arc<EventBus>,
     folder: PathBuf,
     room: watch::Sender<Option<u64>>,
     mut stopping: watch::Receiver<bool>,
 ) {
     let mut ticks = tokio::time::interval(Duration::from_secs(5));
-    let mut said = false;
+    let mut reported = false;
     loop {
         tokio::select! {
             _ = ticks.tick() => {}
             _ = stopping.wait_for(|stop| *stop) => return,
         }
         let folder = folder.clone();
-        // A network drive may take its time.
+        // A network drive may be slow.
         let Ok(free) = tokio::task::spawn_blocking(move || disk::free(&folder)).await else {
             return;
         };
         room.send_replace(free);
         let scarce = bus.recording().is_some() && free.is_some_and(|free| free < disk::SCARCE);
-        if scarce && !said {
+        if scarce && !reported {
             let text = format!("{:.1} GB left for the recording", free.unwrap_or(0) as f64 / 1e9);
             bus.fleet()
-                .say(unix_now(), None, Severity::Critical, "disk", text, None);
+                .add_entry(unix_now(), None, Severity::Critical, "disk", text, None);
         }
-        said = scarce;
+        reported = scarce;
     }
 }
 

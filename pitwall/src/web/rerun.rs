@@ -1,4 +1,4 @@
-//! The Rerun viewer in a pane of the page: started when it is first asked for, served on the page's own origin.
+//! The Rerun viewer in a pane of the page. It starts on the first request and is served from the page's own origin.
 
 use std::net::TcpListener;
 use std::sync::OnceLock;
@@ -13,9 +13,9 @@ use serde_json::json;
 use super::App;
 use crate::rerun::{RerunOutlet, RerunView};
 
-/// The data's server, once it runs.
+/// The running data server.
 pub(super) struct Pane {
-    /// Ends when it is dropped.
+    /// Stops when it is dropped.
     _view: RerunView,
     port: u16,
 }
@@ -23,7 +23,7 @@ pub(super) struct Pane {
 /// The viewer's files.
 static VIEWER: OnceLock<Option<WebViewerData>> = OnceLock::new();
 
-/// Starts the data's server if it does not run yet, and says where the pane is.
+/// Starts the data server if it does not run yet, and returns the URL of the pane.
 pub(super) async fn open(State(app): State<App>) -> Response {
     let mut pane = app.pane.lock().await;
     if pane.is_none() {
@@ -43,8 +43,8 @@ pub(super) async fn open(State(app): State<App>) -> Response {
     Json(json!({"url": format!("/rerun/index.html?hide_welcome_screen&url={source}")})).into_response()
 }
 
-/// One of the viewer's files. It may load itself and talk to the data's server, and to nobody else: left alone, it
-/// would report to an analytics host.
+/// One of the viewer's files. The viewer may only load itself and connect to the data server, because by default it
+/// connects to an analytics host.
 pub(super) async fn file(State(app): State<App>, Path(name): Path<String>) -> Response {
     let Some(viewer) = VIEWER.get_or_init(|| WebViewerData::load(None).ok()) else {
         return (StatusCode::NOT_FOUND, "this program was built without the viewer").into_response();
@@ -72,7 +72,7 @@ pub(super) async fn file(State(app): State<App>, Path(name): Path<String>) -> Re
     response
 }
 
-/// The viewer's page without the links that fetch a font from a host of others.
+/// The viewer's page without the links to a font on another host.
 fn without_foreign_fonts(page: &[u8]) -> Vec<u8> {
     let page = String::from_utf8_lossy(page);
     let mut kept = String::with_capacity(page.len());

@@ -21,48 +21,48 @@ use crate::replay::ReplayView;
 
 /// Snapshots per second.
 const RATE: f64 = 15.0;
-/// Log lines that a page gets when it connects.
+/// Log entries that a page gets when it connects.
 const HISTORY: u64 = 300;
-/// A browser that does not take a message within this time is let go.
-const SLOW: Duration = Duration::from_secs(5);
-/// How often the selected car's lap is painted anew.
-const REPAINT: Duration = Duration::from_secs(1);
-/// A page that has not drawn its last snapshot gets no other for this long: it would wait in the browser and grow old
-/// there. A page in the background draws nothing, and lives on what comes then.
-const UNDRAWN: Duration = Duration::from_millis(400);
+/// A browser that does not accept a message within this time is disconnected.
+const SEND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Period at which the selected car's health profile is sent.
+const PROFILE_PERIOD: Duration = Duration::from_secs(1);
+/// A page that has not drawn its last snapshot gets no other for this long, because it would only wait in the browser. A
+/// page in the background draws nothing and still gets a snapshot after this time.
+const DRAW_TIMEOUT: Duration = Duration::from_millis(400);
 
 /// All cars at one moment.
 #[derive(Serialize)]
 pub(super) struct Snapshot {
-    /// When [unix ns]; in a replay, when in the recording.
+    /// The time shown \[unix ns\]; in a replay, the recording's time.
     now: i64,
-    /// When it was made, by the laptop's clock [unix ns].
+    /// When it was made, by the laptop's clock \[unix ns\].
     made: i64,
     /// Counts the snapshots of this page, from 1.
     number: u64,
-    /// Another one than before: all that was said before is void.
+    /// When it differs from the last one, everything sent before is void.
     epoch: u64,
     cars: Vec<CarView>,
     /// Cars with a map to fetch.
     maps: Vec<CarName>,
     recording: Option<RecordingView>,
-    /// Room on the recordings' disk [bytes].
+    /// Free space on the disk of the recordings \[bytes\].
     disk_free: Option<u64>,
     /// Particles and end points of the selected car.
     selected: Option<Selected>,
-    /// What happened since the last snapshot.
+    /// New log entries.
     log: Vec<LogEntry>,
-    /// Alarms up to this line have been acknowledged.
+    /// Alarms up to this entry have been acknowledged.
     acknowledged: u64,
-    /// Who looks at a page.
+    /// The operators of all open pages.
     operators: Vec<String>,
     replay: Option<ReplayView>,
-    /// In the first snapshot that a page gets.
+    /// Only in the first snapshot of a page.
     #[serde(skip_serializing_if = "Option::is_none")]
     hello: Option<Hello>,
 }
 
-/// What a page needs to know once.
+/// What a page gets once.
 #[derive(Serialize)]
 struct Hello {
     /// True when the Rerun viewer is built in.
@@ -81,27 +81,27 @@ struct RecordingView {
 #[derive(Serialize)]
 struct Selected {
     car: CarName,
-    /// `[x, y, heading, weight]` [m, m, rad, 0..1].
+    /// `[x, y, heading, weight]` \[m, m, rad, 0..1\].
     particles: Vec<[f32; 4]>,
-    /// `[x, y, kind]` [m, m, see `EndPointKind`].
+    /// `[x, y, kind]` \[m, m, a number of `EndPointKind`\].
     end_points: Vec<[f32; 3]>,
-    /// None when they are as they were.
+    /// None when they have not changed.
     #[serde(skip_serializing_if = "Option::is_none")]
     laps: Option<Vec<Lap>>,
-    /// Health along the lap; None when it is as it was.
+    /// Health along the lap; None when it is not due.
     #[serde(skip_serializing_if = "Option::is_none")]
     health_profile: Option<Vec<Option<ProfileCell>>>,
 }
 
-/// What a page says.
+/// A message from a page.
 #[derive(Deserialize)]
 #[serde(untagged)]
-enum Said {
+enum PageMessage {
     Drawn(Drawn),
-    Wish(Wish),
+    Settings(PageSettings),
 }
 
-/// It has drawn a snapshot.
+/// The page has drawn a snapshot.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Drawn {
@@ -109,50 +109,50 @@ struct Drawn {
     drawn: u64,
 }
 
-/// It wants something.
+/// What the page shows, and to whom.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Wish {
-    /// The car whose particles and end points it wants.
+struct PageSettings {
+    /// The selected car: the page gets its particles and end points.
     select: Option<CarName>,
-    /// Who looks at it.
+    /// The operator of the page.
     operator: Option<String>,
 }
 
-/// What one page has been sent.
+/// What has been sent to one page.
 #[derive(Default)]
-struct Seen {
+struct SentState {
     /// The last snapshot.
     number: u64,
-    /// The last log line.
+    /// The last log entry.
     log: u64,
     epoch: Option<u64>,
-    /// The selected car, how many laps it had, and when its lap was painted.
+    /// The selected car, its number of laps, and when its health profile was sent.
     car: Option<(CarName, usize, Instant)>,
 }
 
-impl Seen {
-    fn nothing(app: &App) -> Self {
+impl SentState {
+    fn new(app: &App) -> Self {
         Self {
             log: app.bus.fleet().log().last().saturating_sub(HISTORY),
             ..Self::default()
         }
     }
 
-    /// Details of `car`, leaving out what is as it was.
+    /// Details of `car`, without what has not changed.
     fn details(&mut self, car: &Car) -> Selected {
         let count = car.laps().len();
-        let (laps_known, painted) = match &self.car {
-            Some((name, laps, painted)) if *name == car.name => (Some(*laps), Some(*painted)),
+        let (laps_known, profile_sent) = match &self.car {
+            Some((name, laps, profile_sent)) if *name == car.name => (Some(*laps), Some(*profile_sent)),
             _ => (None, None),
         };
-        let paint = painted.is_none_or(|at| at.elapsed() >= REPAINT);
-        let painted = if paint {
+        let profile_due = profile_sent.is_none_or(|at| at.elapsed() >= PROFILE_PERIOD);
+        let profile_sent = if profile_due {
             Instant::now()
         } else {
-            painted.unwrap_or_else(Instant::now)
+            profile_sent.unwrap_or_else(Instant::now)
         };
-        self.car = Some((car.name.clone(), count, painted));
+        self.car = Some((car.name.clone(), count, profile_sent));
         Selected {
             car: car.name.clone(),
             particles: car
@@ -177,27 +177,27 @@ impl Seen {
                 })
                 .collect(),
             laps: (laps_known != Some(count)).then(|| car.laps().to_vec()),
-            health_profile: paint.then(|| car.health_profile().to_vec()),
+            health_profile: profile_due.then(|| car.health_profile().to_vec()),
         }
     }
 }
 
 impl Snapshot {
-    /// The cars now, and what happened since the page was told last.
-    fn take(app: &App, selected: Option<&CarName>, seen: &mut Seen) -> Self {
+    /// The cars now, and the log entries since the last snapshot.
+    fn take(app: &App, selected: Option<&CarName>, sent_state: &mut SentState) -> Self {
         let now = app.now();
         let fleet = app.bus.fleet();
         let epoch = fleet.epoch();
-        let anew = seen.epoch.replace(epoch) != Some(epoch);
+        let anew = sent_state.epoch.replace(epoch) != Some(epoch);
         if anew {
-            *seen = Seen {
-                number: seen.number,
-                ..Self::anew(&fleet, epoch)
+            *sent_state = SentState {
+                number: sent_state.number,
+                ..Self::restarted(&fleet, epoch)
             };
         }
-        seen.number += 1;
-        let log = fleet.log().since(seen.log).cloned().collect();
-        seen.log = fleet.log().last();
+        sent_state.number += 1;
+        let log = fleet.log().since(sent_state.log).cloned().collect();
+        sent_state.log = fleet.log().last();
         let hello = anew.then(|| Hello {
             rerun: cfg!(feature = "rerun"),
             history: fleet
@@ -207,7 +207,7 @@ impl Snapshot {
         });
         let selected = selected
             .and_then(|name| fleet.car(name))
-            .map(|car| seen.details(car));
+            .map(|car| sent_state.details(car));
         let cars = fleet.view(now);
         let maps = fleet
             .cars()
@@ -219,7 +219,7 @@ impl Snapshot {
         Self {
             now,
             made: crate::clock::unix_now(),
-            number: seen.number,
+            number: sent_state.number,
             epoch,
             cars,
             maps,
@@ -231,24 +231,24 @@ impl Snapshot {
             selected,
             log,
             acknowledged,
-            operators: app.present.names(),
+            operators: app.operators.names(),
             replay: app.replay.as_ref().map(|replay| replay.view()),
             hello,
         }
     }
 
-    fn anew(fleet: &crate::fleet::Fleet, epoch: u64) -> Seen {
-        Seen {
+    fn restarted(fleet: &crate::fleet::Fleet, epoch: u64) -> SentState {
+        SentState {
             log: fleet.log().last().saturating_sub(HISTORY),
             epoch: Some(epoch),
-            ..Seen::default()
+            ..SentState::default()
         }
     }
 }
 
 pub(super) async fn once(State(app): State<App>) -> Json<Snapshot> {
-    let mut seen = Seen::nothing(&app);
-    Json(Snapshot::take(&app, None, &mut seen))
+    let mut sent_state = SentState::new(&app);
+    Json(Snapshot::take(&app, None, &mut sent_state))
 }
 
 pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) -> Response {
@@ -257,41 +257,41 @@ pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) ->
         .on_upgrade(move |socket| follow(app, socket))
 }
 
-/// Sends snapshots until the page goes away. Each is made when it is sent, and sent when the one before has been drawn:
-/// a slow page gets fewer, never older ones.
+/// Sends snapshots until the page is closed. Each is made when it is sent, after the one before has been drawn. A slow
+/// page therefore gets fewer snapshots, but no old ones.
 async fn follow(app: App, mut socket: WebSocket) {
     let mut selected: Option<CarName> = None;
-    let mut seen = Seen::nothing(&app);
-    let present = app.present.enter();
+    let mut sent_state = SentState::new(&app);
+    let page = app.operators.open_page();
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut drawn = 0;
     let mut sent_at = Instant::now();
     loop {
-        let undrawn = drawn < seen.number && sent_at.elapsed() < UNDRAWN;
+        let undrawn = drawn < sent_state.number && sent_at.elapsed() < DRAW_TIMEOUT;
         tokio::select! {
-            // When the page becomes ready after a tick that it has missed, the tick is taken at once.
+            // A page that becomes ready after a missed tick gets its snapshot at once.
             _ = ticks.tick(), if !undrawn => {
                 sent_at = Instant::now();
-                let snapshot = Snapshot::take(&app, selected.as_ref(), &mut seen);
+                let snapshot = Snapshot::take(&app, selected.as_ref(), &mut sent_state);
                 let Ok(text) = serde_json::to_string(&snapshot) else { return };
-                let sent = tokio::time::timeout(SLOW, socket.send(Message::Text(text.into()))).await;
+                let sent = tokio::time::timeout(SEND_TIMEOUT, socket.send(Message::Text(text.into()))).await;
                 if !matches!(sent, Ok(Ok(()))) {
                     return;
                 }
             }
-            () = tokio::time::sleep(UNDRAWN.saturating_sub(sent_at.elapsed())), if undrawn => {}
+            () = tokio::time::sleep(DRAW_TIMEOUT.saturating_sub(sent_at.elapsed())), if undrawn => {}
             message = socket.recv() => match message {
                 Some(Ok(Message::Text(text))) => match serde_json::from_str(&text) {
-                    Ok(Said::Drawn(said)) => drawn = said.drawn,
-                    Ok(Said::Wish(wish)) => {
-                        selected = wish.select;
-                        if let Some(mut operator) = wish.operator {
+                    Ok(PageMessage::Drawn(message)) => drawn = message.drawn,
+                    Ok(PageMessage::Settings(settings)) => {
+                        selected = settings.select;
+                        if let Some(mut operator) = settings.operator {
                             operator.truncate(operator.floor_char_boundary(Command::MAX_OPERATOR));
-                            present.is(operator);
+                            page.set_operator(operator);
                         }
                     }
-                    Err(error) => tracing::debug!(%error, "a page said something strange"),
+                    Err(error) => tracing::debug!(%error, "a page sent an unknown message"),
                 },
                 Some(Ok(_)) => {}
                 Some(Err(_)) | None => return,

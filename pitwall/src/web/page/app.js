@@ -14,10 +14,10 @@ let selected = null;
 let epoch = null;
 let laps = { car: null, laps: [] };
 let pace = "";
-/// How old snapshots were when they had been drawn [ms], the last thousand: for whoever measures this page.
+/// Age of the last thousand snapshots when they were drawn [ms], for measurements.
 const ages = [];
 
-/// Candidates are shown this long at most [ms]: meanwhile the car drives on.
+/// Candidates are shown this long at most [ms], because the car drives on.
 const OFFERED = 30e3;
 let offered = { at: 0, searching: false };
 
@@ -25,7 +25,7 @@ const operator = $("operator");
 operator.value = localStorage.getItem("operator") || "engineer";
 
 async function act(car, action, expected = null) {
-  cards.outcome(car, { done: null, text: "asking the car" });
+  cards.outcome(car, { done: null, text: "waiting for the car" });
   const result = await command(car, operator.value, action, expected);
   cards.outcome(car, result);
   return result;
@@ -46,7 +46,7 @@ const sound = new Sound($("sound"));
 const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"), sound);
 const link = connect(take, ({ up, silent_s: silent, rate }) => {
   const badge = $("link");
-  badge.textContent = up ? (snapshot?.replay ? "replay" : "live") : `no news for ${lasting(silent)}: the pit wall's program does not answer`;
+  badge.textContent = up ? (snapshot?.replay ? "replay" : "live") : `no news for ${lasting(silent)}: the pit wall does not answer`;
   badge.className = `badge ${up ? "up" : "down"}`;
   badge.title = up ? `${fixed(rate, 0)} snapshots a second` : badge.textContent;
   document.body.classList.toggle("cut", !up);
@@ -135,7 +135,7 @@ function showRecording({ recording, disk_free: free, replay }) {
     const left = free !== null && rate > 0 ? `, room for ${fixed(free / rate / 3600, 0)} h` : "";
     text = recording.error ?? `${lasting(recording.seconds)}, ${fixed(recording.bytes / 1e6, 1)} MB${left}, ${missing ? `${missing} MISSING` : "nothing missing"}`;
   }
-  if (ending) text = "ending: waiting for what the cars have sent";
+  if (ending) text = "ending: waiting for missing messages";
   if ($("recording").textContent !== text) $("recording").textContent = text;
   // In full, where the room does not suffice.
   const full = [text, recording?.file].filter(Boolean).join("\n");
@@ -173,22 +173,22 @@ function showReplay(replay) {
   }
   for (const id of ["place", "search", "mark"]) $(id).disabled = true;
 }
-const steer = (wish) => snapshot?.replay && post("/replay", wish);
-const playPause = () => steer({ playing: !snapshot.replay.playing });
-const skip = (s) => steer({ at: Math.max(0, (snapshot?.replay?.at_s ?? 0) + s) });
+const setPlayback = (change) => snapshot?.replay && post("/replay", change);
+const playPause = () => setPlayback({ playing: !snapshot.replay.playing });
+const skip = (s) => setPlayback({ at: Math.max(0, (snapshot?.replay?.at_s ?? 0) + s) });
 $("play").addEventListener("click", playPause);
 $("seek").addEventListener("input", () => { seeking = true; });
 $("seek").addEventListener("change", async () => {
-  await steer({ at: $("seek").value / 1000 * snapshot.replay.duration_s });
+  await setPlayback({ at: $("seek").value / 1000 * snapshot.replay.duration_s });
   seeking = false;
 });
-$("speed").addEventListener("change", () => steer({ speed: Number($("speed").value) }));
+$("speed").addEventListener("change", () => setPlayback({ speed: Number($("speed").value) }));
 
 function place(on) {
   track.placing = on && Boolean(selected);
   press($("place"), track.placing);
   $("map").classList.toggle("placing", track.placing);
-  $("hint").textContent = track.placing ? `press where ${selected} stands, drag towards its heading` : "";
+  $("hint").textContent = track.placing ? `press at the position of ${selected}, drag towards its heading` : "";
 }
 
 async function placed(x, y, heading) {
@@ -196,7 +196,7 @@ async function placed(x, y, heading) {
   await act(selected, { pose: { x, y, heading } });
 }
 
-/// Shows where the car may be, on the track and as buttons. Scores only compare places with each other.
+/// Shows the candidates on the track and as buttons. Scores only compare candidates with each other.
 function offer(candidates) {
   track.candidates = candidates;
   offered = { at: performance.now(), searching: false };
@@ -204,14 +204,14 @@ function offer(candidates) {
   const best = Math.max(...candidates.map(({ score }) => score));
   $("candidates").replaceChildren(...candidates.map(({ number, score }) => {
     const button = element("button", "", score === best ? `${number}: best` : `${number}: ${fixed(score / best * 100, 0)} %`);
-    button.title = `follow place ${number}${score === best ? "" : ", which fits the scans this well beside the best"}`;
+    button.title = `use candidate ${number}${score === best ? "" : ", with its score relative to the best"}`;
     button.addEventListener("click", () => picked(number));
     return button;
   }));
-  $("hint").textContent = candidates.length > 1 ? `${selected} may be in ${candidates.length} places and follows the first: pick another, here or on the track` : "";
+  $("hint").textContent = candidates.length > 1 ? `${selected} has ${candidates.length} candidates and uses the first: pick another here or on the track` : "";
 }
 
-/// Takes the candidates away once the car knows where it is, or they are old.
+/// Removes the candidates when the car is localized, or when they are old.
 function outdate(car) {
   if (!track.candidates.length || !car) return;
   if (car.state !== "LOCALIZED") offered.searching = true;
@@ -273,7 +273,7 @@ $("marker").addEventListener("close", () => {
   if ($("marker").returnValue === "ok" && text) post("/mark", { car: selected, operator: operator.value, text });
 });
 
-/// Shows the Rerun viewer in place of the track, or takes it away again with all that it uses.
+/// Shows the Rerun viewer instead of the track, or removes it with all its resources.
 async function rerun() {
   const viewer = $("viewer");
   const on = viewer.hidden;
@@ -354,5 +354,5 @@ addEventListener("keydown", (event) => {
   }
 });
 
-// For measurements and tests: what the page knows of itself.
+// The page's state, for measurements and tests.
 window.pitwall = { ages, toCanvas: (x, y) => track.toCanvas(x, y), get selected() { return selected; }, get snapshot() { return snapshot; } };

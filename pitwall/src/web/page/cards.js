@@ -2,17 +2,17 @@
 
 import { SPAN_S, plot } from "/chart.js";
 
-/// Shape, colour class and meaning of each state. Shape and word carry what the colour does.
+/// Shape, colour class and meaning of each state. Shape and word have the same meaning as the colour.
 export const STATES = {
   INIT: ["○", "none", "no pose yet"],
-  CONVERGING: ["◐", "busy", "a pose, not yet confirmed"],
-  LOCALIZED: ["●", "good", "the pose can be raced on"],
+  CONVERGING: ["◐", "busy", "the pose is not confirmed yet"],
+  LOCALIZED: ["●", "good", "the pose is good enough for racing"],
   DEGRADED: ["▲", "warn", "the pose is probably right; something is wrong"],
   LOST: ["✖", "bad", "the pose is wrong"],
   RELOCALIZING: ["↻", "busy", "searching the whole map"],
   STALE: ["■", "bad", "no sensor data on the car"],
-  UNKNOWN: ["?", "none", "the pit wall cannot read what the car says of it"],
-  BLIND: ["□", "none", "nothing comes from the car"],
+  UNKNOWN: ["?", "none", "the health messages cannot be decoded"],
+  BLIND: ["□", "none", "nothing arrives from the car"],
 };
 
 const COLOURS = ["#5aa9ff", "#ff9d5c", "#b98cff", "#2fd0c8", "#ff6fae", "#c9c93a", "#7fd46b", "#e07a5f", "#9fb4ff", "#c0a080"];
@@ -23,7 +23,7 @@ export const colourOf = (index) => COLOURS[index % COLOURS.length];
 export const fixed = (value, digits, unit = "") =>
   value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(digits) + unit;
 
-/// A time without an end: 7 s, 3:05, 1:02:30.
+/// Formats a duration: 7 s, 3:05, 1:02:30.
 export const lasting = (s) => {
   if (s === null || s === undefined) return "–";
   if (s < 60) return `${s < 10 ? s.toFixed(1) : Math.floor(s)} s`;
@@ -48,10 +48,10 @@ const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed
 
 export const missing = (car) => Object.values(car.streams).reduce((sum, s) => sum + s.missing, 0);
 
-/// Label, text, what is off about it, and what it means.
+/// Label, text, warning condition, and tooltip.
 export const FACTS = [
   ["speed", (c) => fixed(c.pose?.speed_mps, 1, " m/s"), null, "over ground"],
-  ["age", (c) => age(c), (c) => c.pose?.age_s > 0.15, "how long ago the pose shown was true"],
+  ["age", (c) => age(c), (c) => c.pose?.age_s > 0.15, "age of the pose shown"],
   ["alignment", (c) => fixed(c.health?.metrics && c.health.metrics.alignment * 100, 0, " %"), (c) => c.health?.metrics?.alignment < 0.7, "share of the beams that end at a wall of the map"],
   ["slip", (c) => fixed(c.health?.metrics && c.health.metrics.slip * 100, 0, " %"), (c) => Math.abs(c.health?.metrics?.slip) > 0.08, "share of odometry's distance that was not driven"],
   ["last lap", (c) => fixed(c.last_lap_s, 2, " s"), null, "the last lap"],
@@ -60,21 +60,21 @@ export const FACTS = [
   ["round trip", (c) => ms(c.round_trip_s && c.round_trip_s * 1e3), (c) => c.round_trip_s > 0.1, "to the car and back"],
   ["update p99", (c) => ms(c.load && c.load.update_us.p99 / 1e3), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
   ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
-  ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – where the machine does not tell"],
+  ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – if the machine does not report it"],
   ["missing", (c) => String(missing(c)), null, "messages that were sent and did not arrive"],
 ];
 
-/// Which set would be worth a look beside the one in force.
+/// The set to compare with the one in force.
 export const otherSet = (car) => {
   const names = car.set?.available ?? [];
-  const wish = car.health?.proposal?.set ?? (car.set?.name === "hq" ? "lq" : "hq");
-  return names.includes(wish) ? wish : names.find((name) => name !== car.set?.name);
+  const proposed = car.health?.proposal?.set ?? (car.set?.name === "hq" ? "lq" : "hq");
+  return names.includes(proposed) ? proposed : names.find((name) => name !== car.set?.name);
 };
 
-/// What the comparison says, in one sentence.
+/// The comparison in one sentence.
 export const verdict = (shadow) => {
   const c = shadow.comparison;
-  if (!c) return `${shadow.set} runs in the shadow; nothing to compare yet`;
+  if (!c) return `${shadow.set} runs in the shadow; there is no comparison yet`;
   const [force, other] = [c.in_force.name, shadow.set];
   const lead = c.shadow_better - c.force_better;
   const better = Math.abs(lead) < 0.1 ? `${force} and ${other} fit alike` : lead > 0 ? `${other} fits better than ${force}` : `${force} fits better than ${other}`;
@@ -82,7 +82,7 @@ export const verdict = (shadow) => {
     `alignment ${fixed(c.shadow.alignment * 100, 0)} / ${fixed(c.force.alignment * 100, 0)} %, poses ${fixed(c.distance * 100, 1)} cm apart`;
 };
 
-/// Numbers change this often [ms]: nobody reads faster, and with twenty cars the browser has more to do than that.
+/// Period at which numbers are updated [ms]. Nobody reads faster, and it saves time with twenty cars.
 /// States and causes change at once.
 const READABLE = 190;
 
@@ -117,7 +117,7 @@ export class Cards {
     });
   }
 
-  /// Takes in what the pit wall remembers of each car.
+  /// Sets the history of each car.
   remember(history) {
     for (const card of this.cards.values()) card.history = [];
     for (const [name, moments] of Object.entries(history)) {
@@ -129,7 +129,7 @@ export class Cards {
   history(car) { return this.cards.get(car)?.history ?? []; }
   outcome(car, result) { this.cards.get(car)?.outcome(result); }
 
-  /// Takes away a car that is not there any more, as after a jump of a replay.
+  /// Removes a car that is gone, as after a jump of a replay.
   keep(names) {
     for (const [name, card] of this.cards) {
       if (!names.includes(name)) {
@@ -145,7 +145,7 @@ class Card {
     this.name = name;
     this.acts = acts;
     this.history = [];
-    this.said = null;
+    this.outcomeShown = null;
     this.root = element("article", "card");
     this.root.tabIndex = 0;
     this.root.dataset.car = name;
@@ -182,7 +182,7 @@ class Card {
     this.shadow = this.button("shadow", "run another set beside this one, and compare (s)", () => {
       if (this.car) acts.shadow(name, this.car.shadow ? null : otherSet(this.car));
     });
-    this.find = this.button("find", "let the car search the whole map (g)", () => acts.search(name));
+    this.find = this.button("find", "start a global search (g)", () => acts.search(name));
     note.append(this.note, this.shadow, this.find);
     detail.append(facts, this.spark, this.sets, note);
     this.root.append(head, this.causes, this.brief, detail);
@@ -253,11 +253,11 @@ class Card {
     this.revision = set?.revision ?? null;
   }
 
-  /// One place for what concerns the sets: the answer to the last command for a while, then what the car says.
+  /// The note about the sets: for a while the outcome of the last command, then the car's own state.
   updateNote(car) {
     setText(this.shadow, car.shadow ? "■ shadow" : "shadow");
     const set = car.set;
-    const answer = this.said && (this.said.done !== true || performance.now() - this.said.at < 8000) ? this.said : null;
+    const answer = this.outcomeShown && (this.outcomeShown.done !== true || performance.now() - this.outcomeShown.at < 8000) ? this.outcomeShown : null;
     let [kind, text] = ["", set ? `${set.name} revision ${set.revision} by ${set.who}` : ""];
     if (car.health?.auto) text += "; switches by itself";
     if (car.health?.proposal) [kind, text] = ["warn", `proposes ${car.health.proposal.set}: ${car.health.proposal.evidence}`];
@@ -269,7 +269,7 @@ class Card {
     if (this.note.title !== text) this.note.title = text;
   }
 
-  /// Puts a set in force, if the one that is seen here still is.
+  /// Puts a set in force, if the revision shown is still in force.
   async choose(name) {
     const button = this.setButtons.get(name);
     if (!button || button.classList.contains("pending")) return;
@@ -279,7 +279,7 @@ class Card {
   }
 
   outcome({ done, text }) {
-    this.said = { done, text: text.replace(`${this.name}: `, ""), at: performance.now() };
+    this.outcomeShown = { done, text: text.replace(`${this.name}: `, ""), at: performance.now() };
     if (this.car) this.updateNote(this.car);
   }
 

@@ -3,17 +3,17 @@
 /// Without a snapshot for this long, what the page shows is old [ms].
 const SILENT = 1000;
 
-/// Calls `onSnapshot` for each snapshot, and `onLink` with what is known of the connection twice a second and at each
-/// change: {up, silent_s, rate}. Dials again for ever.
+/// Calls `onSnapshot` for each snapshot, and `onLink` with the state of the connection twice a second and at each
+/// change: {up, silent_s, rate}. Reconnects for ever.
 export function connect(onSnapshot, onLink) {
   let socket = null;
-  let wish = { select: null, operator: null };
+  let settings = { select: null, operator: null };
   let retry = 200;
   let heard = performance.now();
   let open = false;
   let times = [];
-  const tell = () => {
-    if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish));
+  const sendSettings = () => {
+    if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(settings));
   };
   const report = () => {
     const now = performance.now();
@@ -23,7 +23,7 @@ export function connect(onSnapshot, onLink) {
   };
   const dial = () => {
     socket = new WebSocket(`ws://${location.host}/ws`);
-    socket.onopen = () => { retry = 200; open = true; heard = performance.now(); tell(); report(); };
+    socket.onopen = () => { retry = 200; open = true; heard = performance.now(); sendSettings(); report(); };
     socket.onmessage = (message) => {
       const snapshot = JSON.parse(message.data);
       heard = performance.now();
@@ -40,8 +40,8 @@ export function connect(onSnapshot, onLink) {
   dial();
   setInterval(report, 500);
   return {
-    select(car) { wish.select = car; tell(); },
-    operator(name) { wish.operator = name; tell(); },
+    select(car) { settings.select = car; sendSettings(); },
+    operator(name) { settings.operator = name; sendSettings(); },
     /// Asks for the next snapshot: none is sent while one waits to be drawn.
     drawn(number) { if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ drawn: number })); },
   };
@@ -60,18 +60,18 @@ export async function post(path, content) {
     try { body = JSON.parse(text); } catch { /* it is text */ }
     return { ok: response.ok, status: response.status, body };
   } catch {
-    return { ok: false, status: 0, body: "the pit wall's program does not answer" };
+    return { ok: false, status: 0, body: "the pit wall does not answer" };
   }
 }
 
-/// A fresh command id: sent twice, a command is done once.
+/// A new command id: a command that is sent twice is executed once.
 export function newId() {
   const bytes = crypto.getRandomValues(new Uint8Array(16));
   return [...bytes].map((b) => b.toString(16).padStart(2, "0")).join("");
 }
 
-/// Gives a car a command. Resolves to {done, text, verdict}. What got lost between this page and the program is
-/// sent once more with the same id.
+/// Sends a command to a car. Resolves to {done, text, verdict}. A request that is lost on the way to the program is sent
+/// once more with the same id.
 export async function command(car, operator, action, expected = null) {
   const request = { car, operator, expected_revision: expected, id: newId(), action };
   let reply = await post("/command", request);

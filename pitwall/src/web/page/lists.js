@@ -1,4 +1,4 @@
-// What happened, the laps, and every number of the selected car.
+// The log, the laps, and every number of the selected car.
 
 import { colourOf, element, fixed, missing } from "/cards.js";
 
@@ -18,7 +18,7 @@ export class Log {
     filterSeverity.addEventListener("change", () => this.redraw());
   }
 
-  /// Takes in new lines; those up to number `acknowledged` are no alarms any more.
+  /// Adds new entries. Those up to number `acknowledged` are no longer alarms.
   add(entries, acknowledged, first) {
     if (acknowledged !== this.acknowledged) {
       this.acknowledged = acknowledged;
@@ -47,9 +47,9 @@ export class Log {
 
   open(entry) { return entry.severity === "critical" && entry.number > this.acknowledged; }
 
-  /// Adds a line, the newest at the top; one that says the same as the one below it is counted there.
+  /// Adds an entry, the newest at the top. One that repeats the entry below it is counted there.
   show(entry) {
-    // What came late goes where it belongs.
+    // Late entries are sorted in by time.
     let below = this.list.firstChild;
     while (below && Number(below.dataset.at) > entry.at) below = below.nextSibling;
     const text = this.text(entry);
@@ -84,7 +84,7 @@ export class Log {
     for (const entry of this.entries) if (this.wanted(entry)) this.show(entry);
   }
 
-  /// What was said before is void.
+  /// Clears the list.
   restart() {
     this.last = 0;
     this.entries = [];

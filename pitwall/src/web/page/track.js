@@ -22,7 +22,7 @@ export function palette() {
   return colours;
 }
 
-/// Width of what is painted, beside that of what is well: who cannot tell the colours sees the width.
+/// Width of a bad stretch relative to a good one, so that it is visible without colours.
 const WIDTHS = { good: 1, busy: 1.6, warn: 1.8, bad: 2.8 };
 
 /// What can be painted along the track: name, colour of a place, legend.
@@ -212,7 +212,7 @@ export class Track {
     if (!drag || !this.placing) return;
     const [x, y] = this.toMap(...drag.from);
     const [dx, dy] = [drag.to[0] - drag.from[0], drag.from[1] - drag.to[1]];
-    // A click says where, but not which way: a drag of a few pixels is needed.
+    // A click has a position but no heading: a drag of a few pixels is needed.
     if (Math.hypot(dx, dy) > 8) this.placed(x, y, Math.atan2(dy, dx));
   }
 

@@ -1,0 +1,179 @@
+//! A car, ready to be shown or written as JSON.
+
+use std::collections::BTreeMap;
+
+use protocol::{CarInfo, CarName, Health, Load, Shadow, State};
+use serde::Serialize;
+
+use super::car::Car;
+use super::stream_statistics::StreamView;
+
+/// A car, ready to be shown or written as JSON.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CarView {
+    /// Its name.
+    pub car: CarName,
+    /// The state in capitals: one of the car's own, `BLIND` when nothing arrives from it, or `UNKNOWN` when its health
+    /// messages cannot be decoded here.
+    pub state: String,
+    /// The causes in words, the worst first.
+    pub causes: Vec<String>,
+    /// How long the car's own state has lasted \[s\].
+    pub state_for_s: Option<f64>,
+    /// True when nothing arrives from the car: everything below is old.
+    pub blind: bool,
+    /// True while the car's node runs and is connected.
+    pub alive: bool,
+    /// Time since anything arrived \[s\].
+    pub quiet_s: f64,
+    /// The newest pose.
+    pub pose: Option<PoseView>,
+    /// The parameter set in force.
+    pub set: Option<SetView>,
+    /// The shadow set and how it compares; None without one.
+    pub shadow: Option<Shadow>,
+    /// The newest health message.
+    pub health: Option<Health>,
+    /// The newest load message.
+    pub load: Option<Load>,
+    /// Round-trip time to the car \[s\].
+    pub round_trip_s: Option<f64>,
+    /// The car's clock minus this one \[s\].
+    pub clock_offset_s: Option<f64>,
+    /// Maximum error of the offset: half the round-trip time \[s\].
+    pub clock_uncertainty_s: Option<f64>,
+    /// Every stream by topic.
+    pub streams: BTreeMap<&'static str, StreamView>,
+    /// The last lap \[s\].
+    pub last_lap_s: Option<f64>,
+    /// The best lap \[s\].
+    pub best_lap_s: Option<f64>,
+    /// The software on the car.
+    pub info: Option<CarInfo>,
+}
+
+impl Car {
+    /// The car at `now` \[unix ns\].
+    pub fn view(&self, now: i64) -> CarView {
+        let seconds = |ns: i64| ns as f64 * 1e-9;
+        let offset = self.clock_offset();
+        let blind = self.blind(now);
+        let quiet_s = seconds(now - self.last_heard).max(0.0);
+        let why_unknown = self.why_unknown();
+        // The last health message that can be decoded may be old.
+        let health = self.health.as_ref().filter(|_| why_unknown.is_none());
+        let (state, causes) = match health {
+            _ if blind => {
+                let gone = if self.alive {
+                    ""
+                } else {
+                    "the car's node or its link has gone; "
+                };
+                (
+                    "BLIND".to_owned(),
+                    vec![format!("{gone}nothing heard for {quiet_s:.1} s")],
+                )
+            }
+            None => match why_unknown {
+                Some(why) => ("UNKNOWN".to_owned(), vec![why]),
+                None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
+            },
+            Some(health) => (
+                health.state.to_string(),
+                health.causes.iter().map(ToString::to_string).collect(),
+            ),
+        };
+        let best = self.laps().iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
+        CarView {
+            car: self.name.clone(),
+            state,
+            causes,
+            state_for_s: health.map(|health| seconds(now + offset - health.since).max(0.0)),
+            blind,
+            alive: self.alive,
+            quiet_s,
+            pose: self.pose.map(|(header, pose)| PoseView {
+                x_m: pose.pose.x,
+                y_m: pose.pose.y,
+                heading_rad: pose.pose.heading,
+                speed_mps: pose.twist.linear_x.hypot(pose.twist.linear_y),
+                covariance: pose.covariance,
+                s_m: pose.track.map(|track| track.s),
+                d_m: pose.track.map(|track| track.d),
+                lap: pose.lap,
+                update: pose.update,
+                age_s: seconds(now + offset - header.sensor),
+            }),
+            set: self.params.as_ref().map(|params| SetView {
+                name: params.set.name.clone(),
+                revision: params.revision,
+                who: params.who.clone(),
+                when: params.when,
+                available: params.available.clone(),
+                reverts_to: params.pending_revert.as_ref().map(|revert| revert.to.clone()),
+                reverts_in_s: params
+                    .pending_revert
+                    .as_ref()
+                    .map(|revert| seconds(revert.at - now - offset).max(0.0)),
+            }),
+            shadow: self.shadow.clone().filter(|shadow| shadow.set.is_some()),
+            health: health.cloned(),
+            load: self.load.clone(),
+            round_trip_s: self.clock().map(|(_, round_trip)| seconds(round_trip)),
+            clock_offset_s: self.clock().map(|(offset, _)| seconds(offset)),
+            clock_uncertainty_s: self.clock().map(|(_, round_trip)| 0.5 * seconds(round_trip)),
+            streams: self
+                .streams
+                .iter()
+                .map(|(topic, stream)| (topic.as_str(), stream.view(now, offset)))
+                .collect(),
+            last_lap_s: self.laps().last().map(|lap| lap.time_s),
+            best_lap_s: best,
+            info: self.info.clone(),
+        }
+    }
+}
+
+/// A pose, ready to be shown.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PoseView {
+    /// Position in `map` \[m\].
+    pub x_m: f64,
+    /// Position in `map` \[m\].
+    pub y_m: f64,
+    /// Heading \[rad\].
+    pub heading_rad: f64,
+    /// Speed over ground \[m/s\].
+    pub speed_mps: f64,
+    /// Uncertainty.
+    pub covariance: protocol::Covariance,
+    /// Arc length on the raceline \[m\].
+    pub s_m: Option<f64>,
+    /// Distance from the raceline, left positive \[m\].
+    pub d_m: Option<f64>,
+    /// Laps begun.
+    pub lap: u32,
+    /// The filter update.
+    pub update: u64,
+    /// Age \[s\].
+    pub age_s: f64,
+}
+
+/// The set in force, ready to be shown.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SetView {
+    /// Its name.
+    pub name: String,
+    /// Its revision.
+    pub revision: u64,
+    /// The operator who put it in force.
+    pub who: String,
+    /// When \[unix ns, the car's clock\].
+    pub when: i64,
+    /// All sets on the car.
+    pub available: Vec<String>,
+    /// The set that the car falls back to unless this one is confirmed.
+    pub reverts_to: Option<String>,
+    /// Time until then \[s from now\].
+    pub reverts_in_s: Option<f64>,
+}

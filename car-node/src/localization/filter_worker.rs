@@ -11,6 +11,7 @@ use protocol::{EventKind, Rates, SetRef};
 use synpf::{Dropped, Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, TrackMap, Update};
 
 use super::filter_command::{FilterCommand, LocalizerChange};
+use super::job_worker::JobWorker;
 use super::lap_counter::LapCounter;
 use super::pace::Pace;
 use super::shadow_channel::{ShadowInput, ShadowScan, ShadowSender};
@@ -79,6 +80,7 @@ struct FilterWorker {
     last_odometry: Option<Pose>,
     listed: Listed,
     tables: TableWorker,
+    jobs: JobWorker,
 }
 
 /// Health is checked at least this often, sensor data or not.
@@ -91,6 +93,7 @@ pub fn start(
     commands: Receiver<FilterCommand>,
 ) -> std::io::Result<JoinHandle<()>> {
     let tables = TableWorker::start(Arc::clone(&config.map))?;
+    let jobs = JobWorker::start()?;
     thread::Builder::new().name("filter".into()).spawn(move || {
         let last_state = config.monitor.verdict().state;
         FilterWorker {
@@ -104,6 +107,7 @@ pub fn start(
             last_odometry: None,
             listed: Listed::default(),
             tables,
+            jobs,
         }
         .run(feed, &commands);
     })
@@ -204,6 +208,7 @@ impl FilterWorker {
             LocalizerChange::Replace(mut successor) => {
                 successor.take_over(localizer.hand_over());
                 *localizer = successor;
+                self.jobs.discard();
                 Ok(())
             }
         }
@@ -326,9 +331,11 @@ impl FilterWorker {
 
     fn on_scan(&mut self, scan: Scan, queued: usize) -> Result<(), Dropped> {
         let before = Instant::now();
+        self.jobs.hand_in(self.config.localizer.as_mut());
         let result = self.config.localizer.on_scan(&scan);
         let taken = before.elapsed().as_secs_f64();
         self.tables.build_pending();
+        self.jobs.take_from(self.config.localizer.as_mut());
         let now = self.now();
         let rates = self.rates();
         let update = match result {

@@ -2,6 +2,7 @@
 
 pub mod filter_command;
 pub mod filter_worker;
+mod job_worker;
 pub mod lap_counter;
 mod localizer_parameters;
 mod pace;

@@ -16,6 +16,8 @@ pub(super) struct CauseSources<'a> {
     pub(super) odometry_jump: Option<f64>,
     /// A recent jump of a pose that was trusted [m].
     pub(super) pose_jump: Option<f64>,
+    /// The localizer has given its pose up.
+    pub(super) gave_up: bool,
     /// The metrics that are over their limits.
     pub(super) findings: Vec<&'a Finding>,
 }
@@ -63,7 +65,7 @@ impl CauseSources<'_> {
             .filter(|finding| pose_jump.is_none() || finding.kind != CauseKind::Innovation)
             .map(|f| measured(f.kind, f.severity, f.value, f.limit));
         let mut causes: Vec<Cause> = silent
-            .chain(of_state(self.state))
+            .chain(of_state(self.state, self.gave_up))
             .chain(refused)
             .chain(odometry_jump)
             .chain(pose_jump)
@@ -74,12 +76,13 @@ impl CauseSources<'_> {
     }
 }
 
-/// The cause that a state has by itself.
-fn of_state(state: State) -> Option<Cause> {
+/// The cause that a state has by itself. `gave_up`: the localizer has given its pose up.
+fn of_state(state: State, gave_up: bool) -> Option<Cause> {
     match state {
         State::Init => Some(plain(CauseKind::NoInitialPose, Severity::Warning)),
         State::Converging => Some(plain(CauseKind::NewPose, Severity::Info)),
         State::Relocalizing => Some(plain(CauseKind::Searching, Severity::Warning)),
+        State::Lost if gave_up => Some(plain(CauseKind::Searching, Severity::Warning)),
         State::Localized | State::Degraded | State::Lost | State::Stale => None,
     }
 }

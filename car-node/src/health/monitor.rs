@@ -45,6 +45,8 @@ pub struct Monitor {
     lost_since: [Option<Stamp>; Family::COUNT],
     /// Since when the scan has been so far off the walls that nothing else is needed.
     wrong_since: Option<Stamp>,
+    /// The localizer has given its pose up with the last scan.
+    gave_up: bool,
     /// Since when nothing has been wrong.
     good_since: Option<Stamp>,
     /// Distance driven since the state was entered and since anything was wrong [m].
@@ -81,6 +83,7 @@ impl Monitor {
             fit: None,
             lost_since: [None; Family::COUNT],
             wrong_since: None,
+            gave_up: false,
             good_since: None,
             driven: 0.0,
             last_update: None,
@@ -167,6 +170,7 @@ impl Monitor {
         self.last_update = Some(update.stamp);
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
+        self.gave_up = update.mode == Mode::Searching;
         self.advance(update.mode, pose_jump.is_some(), update.stamp, now);
         self.verdict.causes = self.causes(silent, now);
         &self.verdict
@@ -338,6 +342,7 @@ impl Monitor {
                 .is_some_and(|[first, last]| last.since(first) >= self.thresholds.bad_for),
             odometry_jump: recent(self.odometry_jump),
             pose_jump: recent(self.pose_jump),
+            gave_up: self.gave_up,
             findings: self
                 .findings
                 .iter()
@@ -575,7 +580,8 @@ mod tests {
         });
         assert_eq!(drive.monitor.verdict().state, State::Lost);
         let causes = drive.monitor.verdict().causes.iter().map(ToString::to_string);
-        assert!(causes.eq(["odometry jump 7.00 m"]), "{:?}", drive.kinds());
+        let expected = ["searching the whole map", "odometry jump 7.00 m"];
+        assert!(causes.eq(expected), "{:?}", drive.kinds());
         drive.drive(5.0, |_| ());
         assert_eq!(drive.monitor.verdict().causes, []);
     }
@@ -585,6 +591,8 @@ mod tests {
         let mut drive = Drive::localized();
         let searching = |update: &mut Update| update.mode = Mode::Searching;
         assert_eq!(drive.drive(SCAN, searching), [State::Localized, State::Lost]);
+        // The scans fit, so nothing else is a cause.
+        assert_eq!(drive.kinds(), [CauseKind::Searching]);
         assert_eq!(drive.drive(SCAN, searching), [State::Lost, State::Relocalizing]);
         assert!(drive.kinds().contains(&CauseKind::Searching));
         assert_eq!(

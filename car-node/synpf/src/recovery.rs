@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use self::continuity::Continuity;
 use self::fit_change::FitChangeDetector;
 use self::loss_detector::LossDetector;
-use self::rivals::{Incumbent, Rivals};
+use self::rivals::{Incumbent, Rival, Rivals};
 use self::scan_likelihood::fit_of;
 use crate::estimate::Estimate;
 use crate::global_search::{
@@ -569,7 +569,7 @@ impl Recovery {
         if leading.is_none() && !self.loss.broken(p) {
             return None;
         }
-        let lead = best.map_or(0.0, |rival| rival.lead());
+        let lead = best.map_or(0.0, Rival::lead);
         Some(InDoubt {
             probability: 1.0 / (1.0 + (self.loss.odds() - p.piece_odds * lead).exp()),
             rival: best.map(|rival| rival.candidate.estimate.pose),

@@ -11,7 +11,7 @@ use maps::Pose;
 use serde::Serialize;
 use synpf::Stamp;
 
-/// A room of 8 m x 4 m with walls one cell thick, and a recess that tells one end from the other.
+/// A room of 8 m x 4 m with walls one cell thick, and a recess that makes its ends different.
 const WIDTH: usize = 160;
 const HEIGHT: usize = 80;
 const RESOLUTION: f64 = 0.05;
@@ -229,7 +229,7 @@ fn a_drive_is_localized_measured_and_repeatable() {
     assert_eq!(lines.count() as u64, updates);
     assert!(text.contains("\n1700000000.050000000,"), "stamps are the scans'");
 
-    // Held against its own poses it is right, and started from them too.
+    // Its own poses serve as truth and as the start.
     let own = poses.to_str().expect("UTF-8");
     let output = evaluate(&map, &bag, &["--truth", own, "--initial-pose", "truth", "--json"]);
     let held: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
@@ -268,7 +268,7 @@ fn faults_are_named_with_their_file() {
     let folder = tempfile::tempdir().expect("folder");
     let here = folder.path();
     let (map, bag) = (write_map(here), write_bag(here));
-    // A bag cut short in the middle, as by a full disk.
+    // A bag that was cut off in the middle, as by a full disk.
     let bytes = fs::read(&bag).expect("reads");
     let cut = here.join("cut.mcap");
     fs::write(&cut, &bytes[..bytes.len() / 2]).expect("writes");
@@ -281,7 +281,7 @@ fn faults_are_named_with_their_file() {
             assert!(text.contains(word), "{text} should say {word}");
         }
     };
-    // A fault of the files.
+    // Faulty files.
     fails(
         1,
         &map,
@@ -297,7 +297,7 @@ fn faults_are_named_with_their_file() {
     fs::write(&poses, "stamp_s,x,y,heading_rad\n").expect("writes");
     let truth = ["--truth", poses.to_str().expect("UTF-8")];
     fails(1, &map, &bag, &truth, &["truth.csv: no columns", "laser_x_m"]);
-    // A fault of the call.
+    // Wrong usage.
     fails(
         2,
         &map,

@@ -1,5 +1,5 @@
-//! What the health state says on a simulated track: a kidnapping is LOST within half a second, and nothing else is.
-//! Everything runs on the simulator's clock, so that the machine's load changes nothing.
+//! The health state on a simulated track: a kidnapping is LOST within half a second, and nothing else is LOST. Everything runs on
+//! the simulator's clock, so that the load of the machine has no effect.
 
 use std::f64::consts::FRAC_PI_2;
 use std::path::Path;
@@ -72,7 +72,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
     log
 }
 
-/// A lap and a half with nothing wrong, driven once for all tests.
+/// A lap and a half without faults, driven once for all tests.
 fn sound() -> SensorLog {
     static LOG: OnceLock<SensorLog> = OnceLock::new();
     LOG.get_or_init(|| race(club(), &[], 20.0, 20.0)).clone()
@@ -83,7 +83,7 @@ fn localizer(map: &Arc<TrackMap>, mount: Mount) -> Box<dyn Localizer> {
     hq.build(map, mount.base_link_from_laser, 7).expect("sound")
 }
 
-/// What the state says over a log, from the true start moved by `off`.
+/// The outcome over a log, started from the true pose moved by `off`.
 fn judge(log: &SensorLog, grid: OccupancyGrid, off: Pose) -> Outcome {
     let map = Arc::new(TrackMap::new(grid).expect("free cells"));
     let mut localizer = localizer(&map, log.mount.expect("known"));
@@ -107,7 +107,7 @@ fn never_lost(outcome: &Outcome) {
         "{:?}",
         outcome.state_changes
     );
-    // What was expected not to matter did not: the pose was right all the time.
+    // The pose was right all the time.
     let errors = outcome.errors.as_ref().expect("truth");
     assert!(errors.position_error_m.max < 0.2, "{errors:?}");
 }
@@ -159,7 +159,7 @@ fn silent_sensors_are_stale_and_no_false_loss() {
             "{report:?} {:?}",
             outcome.state_changes
         );
-        // A second and a half without odometry may cost the pose; then, and only then, the car is lost.
+        // 1.5 s without odometry may lose the pose. Only then the car is LOST.
         assert_eq!(
             outcome.state_truth.expect("truth").false_lost,
             0,
@@ -224,7 +224,7 @@ fn standing_still_is_no_loss() {
 
 #[test]
 fn a_map_that_is_out_of_date_is_no_loss() {
-    // In every third square of 2 m the walls of the map stand 0.4 m from where they are.
+    // In every third square of 2 m the walls of the map are moved by 0.4 m.
     let mut grid = club().grid;
     let tile = (2.0 / grid.resolution) as usize;
     let shift = (0.4 / grid.resolution) as usize;
@@ -250,7 +250,7 @@ fn a_map_that_is_out_of_date_is_no_loss() {
 #[test]
 fn a_car_with_a_wrong_initial_pose_ends_localized_at_the_right_one() {
     let log = sound();
-    // Across the track, as somebody may drag it on the page. The filter turns it along one way or the other first.
+    // Across the track, as an operator may set it on the page.
     let outcome = judge(&log, club().grid, Pose::new(0.0, 0.0, FRAC_PI_2));
     let last = outcome.state_changes.last().expect("changes");
     assert_eq!(last.state, State::Localized, "{:?}", outcome.state_changes);
@@ -258,7 +258,7 @@ fn a_car_with_a_wrong_initial_pose_ends_localized_at_the_right_one() {
         outcome.errors.expect("truth"),
         outcome.state_truth.expect("truth"),
     );
-    // Two seconds in it may still be on its way there.
+    // It may take two seconds.
     assert!(errors.position_error_m.p95 < 0.1, "{errors:?}");
     assert!(truth.precision > Some(0.97), "{truth:?}");
     assert!(last.at_s < 5.0, "{:?}", outcome.state_changes);

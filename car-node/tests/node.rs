@@ -26,7 +26,7 @@ use zenoh::{Config, Session, Wait};
 
 const DEADLINE: Duration = Duration::from_secs(30);
 
-/// The laptop's end.
+/// The pit wall's end of the network.
 struct Wall {
     session: Session,
     endpoint: String,
@@ -59,7 +59,7 @@ impl Wall {
         }
     }
 
-    /// Asks a car; None when nobody answers, Err for an answer that says the question is broken.
+    /// Queries a car. None without a reply, Err for a reply that refuses the query.
     fn ask(&self, key: &str, payload: Vec<u8>) -> Option<Result<Vec<u8>, String>> {
         let replies = self
             .session
@@ -133,7 +133,7 @@ fn start(name: &str, wall: &Wall, change: impl FnOnce(&mut NodeConfig)) -> (Node
     (Node::start(config).expect("starts"), car)
 }
 
-/// Starts a car, and waits until it can be given commands.
+/// Starts a car, and waits until it takes commands.
 fn start_and_wait(name: &str, wall: &Wall, change: impl FnOnce(&mut NodeConfig)) -> (Node, CarName) {
     let (node, car) = start(name, wall, change);
     wall.wait_for(&car);
@@ -151,10 +151,10 @@ fn revision(answer: &Answer) -> u64 {
     answer.set.revision
 }
 
-/// A simulated car to which others send initial poses and requests.
+/// A simulated car that gets initial poses and requests from its own network.
 struct WithRequests {
     car: SimulatedCar,
-    /// One of them comes with every hundredth message.
+    /// Every hundredth message is replaced by one of these.
     requests: VecDeque<Feed>,
     messages: usize,
 }
@@ -217,7 +217,7 @@ fn initial_poses_and_searches_from_the_car_are_events_at_the_pit_wall() {
             messages: 0,
         });
     });
-    // The pose off the map used to be dropped without a word.
+    // The pose off the map used to be dropped without an event.
     let relevant = |event: &Event| {
         matches!(
             event.kind,
@@ -283,7 +283,7 @@ fn sets_are_switched_on_a_running_car() {
     let wall = Wall::open();
     let (node, car) = start_and_wait("bravo", &wall, |_| ());
     let params = wall.subscribe(&car, Topic::Params);
-    // The recorder's stream: the live one leaves poses out when the machine is busy.
+    // The recorder's stream: the live one skips poses when the machine is busy.
     let poses = wall.subscribe(&car, Topic::RecordedPose);
     next::<Pose>(&poses, |pose| pose.update > 5);
 
@@ -299,9 +299,9 @@ fn sets_are_switched_on_a_running_car() {
     let (_, told) = next::<Params>(&params, |params| params.set.name == "lq");
     assert_eq!((told.revision, told.who.as_str()), (revision(&answer), "anna"));
 
-    // The same command again is answered again, and not done again.
+    // A repeated command gets the same answer, and is not executed again.
     assert_eq!(wall.command(&car, 1, None, select("lq", None)), answer);
-    // Somebody who has not seen it is told so.
+    // A command with an old revision is refused as stale.
     let stale = wall.command(&car, 2, Some(revision(&answer) - 1), select("hq", None));
     assert!(
         matches!(stale.outcome, Outcome::StaleRevision { .. }),
@@ -317,7 +317,7 @@ fn sets_are_switched_on_a_running_car() {
         "{faults:?}"
     );
 
-    // A trial that nobody confirms ends by itself.
+    // A trial that nobody confirms is reverted.
     let trial = wall.command(&car, 4, Some(revision(&answer)), select("adaptive", Some(300)));
     assert_eq!(trial.set.name, "adaptive");
     let (_, told) = next::<Params>(&params, |params| params.revision > revision(&trial));
@@ -357,7 +357,7 @@ fn a_set_put_on_the_car_survives_a_restart() {
     let events = wall.subscribe(&car, Topic::Event);
     let answer = wall.command(&car, 2, None, put("mine", Value::Int(1400)));
     assert!(matches!(answer.outcome, Outcome::Done { .. }), "{answer:?}");
-    // What was before, and what is now: against the set in force, and then against what it was itself.
+    // The changes: against the set in force, and then against its own earlier values.
     let stored = |expected: &str| {
         let (_, event) = next::<Event>(&events, |event| matches!(event.kind, EventKind::SetStored { .. }));
         assert_eq!(event.kind.to_string(), expected);
@@ -366,7 +366,7 @@ fn a_set_put_on_the_car_survives_a_restart() {
     wall.command(&car, 20, None, put("mine", Value::Int(1300)));
     stored("set mine replaced: max_particles 1400 -> 1300");
     let answer = wall.command(&car, 21, None, put("mine", Value::Int(1500)));
-    // The same command again is answered again; another one under its id is refused.
+    // A repeated command gets the same answer. Another command with its id is refused.
     assert_eq!(
         wall.command(&car, 21, None, put("mine", Value::Int(1500))),
         answer
@@ -410,7 +410,7 @@ fn malformed_messages_are_refused_and_the_car_drives_on() {
     let load = wall.subscribe(&car, Topic::Load);
     let key = |topic: Topic| Key::new(car.clone(), topic).to_string();
     let mut rubbish: Vec<Vec<u8>> = vec![vec![], vec![0; 3], vec![0xff; 100_000], b"SYPF".to_vec()];
-    // Bytes from a fixed sequence, some of them with a sound header in front.
+    // Bytes from a fixed sequence, some of them after a valid header.
     let stamps = Stamps {
         run_id: 1,
         sequence: 1,
@@ -612,7 +612,7 @@ fn missing_messages_are_sent_again_on_request() {
     };
     let (header, reply) = ask(0, vec![[1, 1]]);
     assert_eq!(reply.messages, [], "of another run");
-    // Every stream that must be whole is kept, as soon as it has begun.
+    // Every stream that must be complete is kept from its first message on.
     let begun = Instant::now();
     for topic in Topic::all().filter(|topic| topic.recovered()) {
         while !ask(0, Vec::new())
@@ -640,7 +640,7 @@ fn rates_are_lowered_on_a_slow_link_with_an_event() {
     let (node, car) = start_and_wait("golf", &wall, |_| ());
     let events = wall.subscribe(&car, Topic::Event);
     let key = Key::new(car.clone(), Topic::Link).to_string();
-    // A pit wall says once in a while how late poses are, until the car has taken it in.
+    // A pit wall reports late poses until the car reacts.
     let until = |transit: f32, wanted: fn(&EventKind) -> bool| {
         let begun = Instant::now();
         loop {
@@ -663,7 +663,7 @@ fn rates_are_lowered_on_a_slow_link_with_an_event() {
     let lowered = until(0.9, |kind| matches!(kind, EventKind::RatesLowered { .. }));
     assert!(lowered.to_string().contains("slow link"), "{lowered}");
     until(0.01, |kind| *kind == EventKind::RatesRestored);
-    // What is no report is counted.
+    // A malformed report is counted.
     let before = node.shared().counters.read().payloads;
     wall.session.put(&key, vec![0xff; 9]).wait().expect("sends");
     let begun = Instant::now();

@@ -1,7 +1,7 @@
-//! Every ordered pair of shipped sets, switched by command on a car that drives on slipping tyres: the pose goes on.
+//! Every ordered pair of shipped sets, switched by command on a car that drives on slipping tyres: the pose continues.
 //!
 //! The car drives on the filter's estimates. The test waits for the filter after each odometry message, so that the
-//! machine's load changes nothing.
+//! load of the machine has no effect.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -42,17 +42,17 @@ const CIRCUIT: [&str; 13] = [
     "hq",
 ];
 
-/// The car drives so long before the first switch, and then under each set [s].
+/// The car drives this long before the first switch, and then under each set [s].
 const BEFORE: f64 = 4.0;
 const UNDER_EACH: f64 = 1.5;
 
 /// The reference is off by up to 0.3 m here.
 const NEAR: f64 = 0.5;
 
-/// The filter answers within this, or hangs.
+/// The filter replies within this time, or it hangs.
 const DEADLINE: Duration = Duration::from_mins(1);
 
-/// A filter and what commands it, without a network.
+/// A filter that takes commands, without a network.
 struct Car {
     handler: CommandHandler,
     shared: Arc<SharedState>,
@@ -224,7 +224,7 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
     }
 }
 
-/// The way that the car has driven [m].
+/// The distance that the car has driven [m].
 fn truth_length(truth: &Truth, estimates: &[(usize, PoseEstimate)]) -> f64 {
     let poses: Vec<Pose> = estimates
         .iter()

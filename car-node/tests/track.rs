@@ -1,4 +1,4 @@
-//! `car-node track` and `race` as a user calls them, with input that is good and input that is not.
+//! `car-node track` and `race` as a user calls them, with valid and with faulty input.
 
 use std::fs;
 use std::path::Path;
@@ -17,7 +17,7 @@ fn car_node(folder: &Path, arguments: &[&str]) -> Output {
         .expect("the program starts")
 }
 
-/// What it complains of; it must fail with that code, and say so in one line that begins with its name.
+/// The message of a call that must fail with this code. It is one line that starts with the program's name.
 fn complaint(folder: &Path, arguments: &[&str], code: i32) -> String {
     let output = car_node(folder, arguments);
     let text = String::from_utf8(output.stderr).expect("text");
@@ -83,13 +83,13 @@ fn a_faulty_description_is_refused_by_its_key_or_line_and_writes_nothing() {
             "margin: 0.3\nblocks: [{ at: [2, 1], size: [1e9, 1] }]",
             "blocks: block 1",
         ),
-        // A line that crosses itself runs into its own walls.
+        // A line that crosses itself hits its own walls.
         (
             "[[0, 0], [4, -2], [8, 0], [8, 3], [4, 5], [0, 3]]",
             "[[0, 0], [6, 4], [6, 0], [0, 4]]",
             "cannot be raced on: ",
         ),
-        // No bend that a car can take, though the road is wide enough.
+        // A bend that is too tight for a car, although the road is wide enough.
         (
             "[[0, 0], [4, -2], [8, 0], [8, 3], [4, 5], [0, 3]]",
             "[[0, 0], [0.4, 0], [0, 0.4]]",
@@ -142,7 +142,7 @@ fn missing_existing_and_damaged_files_are_named() {
         "none/club.svg: ",
     );
     fails(2, &["race", "--params", "none"], "none");
-    // Whatever the seed, there is a race.
+    // Every seed gives a track that can be raced on.
     let last = u64::MAX.to_string();
     let race = car_node(
         here,

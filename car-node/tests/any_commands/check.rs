@@ -1,6 +1,6 @@
-//! A car's command handler, on a running filter, under anything that a network can bring.
+//! A car's command handler, on a running filter, with any input from a network.
 //!
-//! Shared by the test, which rolls dice, and by the fuzz target, which looks where the dice do not fall.
+//! Shared by the test, whose input is random, and by the fuzz target, whose input is guided by coverage.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
@@ -30,24 +30,24 @@ use protocol::{
 };
 use synpf::{Odometry, Scan, Stamp, TrackMap, Twist};
 
-/// What can happen to a car. Numbers come with all their bits: NaN, infinities, subnormals.
+/// What can happen to a car. Numbers have any bits: NaN, infinities, subnormals.
 #[derive(Debug, Arbitrary)]
 enum Step {
     /// Any bytes under any topic.
     Bytes(u8, Vec<u8>),
-    /// Any bytes behind a sound header.
+    /// Any bytes after a valid header.
     Payload(u8, Vec<u8>),
-    /// Nothing under a topic.
+    /// An empty payload under a topic.
     NoPayload(u8),
-    /// A command that has the right shape.
+    /// A well-formed command.
     Command(Given),
-    /// What a pit wall says of the link.
+    /// A pit wall's report on the link.
     Report(f32, f32, u32),
-    /// A few scans as a laser makes them, and odometry.
+    /// Some scans and odometry.
     Drive(u8),
-    /// A deadline may be over.
+    /// Time passes, so that deadlines end.
     Clock,
-    /// The car is switched off and on.
+    /// The car restarts.
     Restart,
 }
 
@@ -61,7 +61,7 @@ struct Given {
     astray: Astray,
 }
 
-/// Where a command goes: mostly where it belongs.
+/// The topic of a command: mostly its own.
 #[derive(Debug, Arbitrary)]
 enum Astray {
     Not,
@@ -104,7 +104,7 @@ enum AnyValue {
     Int(i64),
     Small(i8),
     Float(f64),
-    /// In quarters.
+    /// In units of 0.25.
     Sane(u8),
     Text(String),
     Word(u8),
@@ -117,7 +117,7 @@ enum Any {
     Trial(Name),
     Put(Name, Vec<(u16, AnyValue)>, Option<u32>),
     PutUnknown(Name, Vec<(String, AnyValue)>),
-    /// So many values of such a length, none of them sound.
+    /// A number of values of some length, none of them valid.
     Flood(u16, u16),
     Confirm,
     Revert,
@@ -134,7 +134,7 @@ enum Any {
     Auto(bool),
 }
 
-/// A car that takes commands, but for the network.
+/// A car that takes commands, without a network.
 struct Car {
     handler: CommandHandler,
     shared: Arc<SharedState>,
@@ -142,11 +142,11 @@ struct Car {
     filter: JoinHandle<()>,
     shadow: JoinHandle<()>,
     revisions: u64,
-    /// Answers that it has given, and must give again.
+    /// Its earlier answers, which it must repeat.
     given: BTreeMap<CommandId, CachedAnswer>,
 }
 
-/// What must be as before after a command that was refused.
+/// What a refused command must not change.
 #[derive(Debug, PartialEq)]
 struct State {
     memory: PersistedState,

@@ -98,7 +98,7 @@ pub enum BagError {
         source: io::Error,
     },
     /// The file is not MCAP, or is damaged.
-    #[error("{path}: not a readable MCAP file after {messages} messages: {source}{}", advice(.source, *.messages))]
+    #[error("{path}: not a readable MCAP file after {messages} messages: {source}{}", advice(.source))]
     Mcap {
         /// The bag.
         path: PathBuf,
@@ -144,10 +144,10 @@ pub enum BagError {
 }
 
 /// Advice for a file that does not read.
-fn advice(fault: &McapError, messages: u64) -> &'static str {
+fn advice(fault: &McapError) -> &'static str {
     match fault {
         McapError::BadMagic => " (`ros2 bag convert` makes one of a .db3 bag)",
-        McapError::UnexpectedEof if messages > 0 => " (`mcap recover` saves what is whole)",
+        McapError::UnexpectedEof => " (`mcap recover` saves what is intact)",
         _ => "",
     }
 }

@@ -83,21 +83,24 @@ impl Continuity {
             return if first { Continued::Yes } else { Continued::Unknown };
         }
         let laser = scan.base_link_from_laser;
-        let agreeing = self
-            .moved
-            .iter()
-            .filter_map(|moved| agreement(&mut self.outline, &self.reference, *moved, scan, laser))
-            .fold(None, |best: Option<f64>, share| {
-                Some(best.map_or(share, |best| best.max(share)))
-            });
-        let Some(agreeing) = agreeing else {
+        let usual = self.usual.max(LEAST_USUAL);
+        // Exponential about its mean for a car that drives, anything alike for one that was carried.
+        let ratio_of = |differing: f64| differing / usual + usual.ln();
+        let mut differing = None;
+        for moved in self.moved {
+            let share =
+                agreement(&mut self.outline, &self.reference, moved, scan, laser).map(|share| 1.0 - share);
+            differing = [differing, share].into_iter().flatten().reduce(f64::min);
+            // One motion under which the scans agree is enough, and odometry's nearly always is one.
+            if differing.is_some_and(|differing| ratio_of(differing) <= 0.0) {
+                break;
+            }
+        }
+        let Some(differing) = differing else {
             self.renew(scan);
             return Continued::Yes;
         };
-        // Exponential about its mean for a car that drives, anything alike for one that was carried.
-        let differing = 1.0 - agreeing;
-        let usual = self.usual.max(LEAST_USUAL);
-        let ratio = differing / usual + usual.ln();
+        let ratio = ratio_of(differing);
         if ratio <= 0.0 {
             let gain = 1.0 - (-seconds / LEARNED_OVER).exp();
             self.usual += gain * (differing - self.usual);

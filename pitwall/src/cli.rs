@@ -54,7 +54,7 @@ const GLOBAL: &str = "Global options";
 const EXIT_CODES: &str = "Without --listen and --connect, the program joins the pit wall that runs on this laptop. If none \
 runs, it listens for the cars itself on tcp/0.0.0.0:7447.
 
-Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict,
+Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict, \
 7 recovered with losses.";
 
 #[derive(Debug, Args)]

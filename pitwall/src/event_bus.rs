@@ -222,7 +222,8 @@ mod tests {
         let recorder = Recorder::start(&path).expect("begun");
         bus.attach_recorder(recorder, 0).ok().expect("the only one");
         let events = bus.subscribe(0);
-        publish_from_threads(&bus, 400);
+        // Fewer than a subscriber may be behind, and enough for the threads to run at the same time.
+        publish_from_threads(&bus, 4500);
         let applied: Vec<_> = bus
             .fleet()
             .log()
@@ -230,16 +231,16 @@ mod tests {
             .filter(|entry| entry.kind == "marker")
             .map(|entry| entry.text.clone())
             .collect();
-        assert_eq!(applied.len(), 1600);
         let received: Vec<_> = events.try_iter().filter_map(|event| text(&event)).collect();
-        assert!(received == applied, "subscribers");
+        assert_eq!(received.len(), 18_000);
+        assert!(received.ends_with(&applied), "the log keeps the last ones");
         let recorder = bus.detach_recorder().expect("a recorder");
         recorder.finish().expect("written");
         let recorded: Vec<_> = read_events(&path)
             .expect("opens")
             .filter_map(|event| text(&event.expect("whole")))
             .collect();
-        assert!(recorded == applied, "recording");
+        assert!(recorded == received, "the recording");
     }
 
     #[test]

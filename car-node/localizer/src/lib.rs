@@ -21,6 +21,7 @@
 mod hand_over;
 mod parameters;
 mod scan_fit;
+mod sensor_finding;
 mod sensors;
 mod stamp;
 mod update;
@@ -33,6 +34,7 @@ use maps::Pose;
 pub use hand_over::{HandOver, HandedEstimate};
 pub use parameters::{ParameterFault, ParameterValues, PreparedParameters, overlay, to_values};
 pub use scan_fit::ScanFit;
+pub use sensor_finding::{SensorFinding, SensorFindings};
 pub use sensors::{Odometry, Scan, Twist, YawRate};
 pub use stamp::Stamp;
 pub use update::{Doubt, Dropped, Hypothesis, Mode, Update, WeightedPose};

@@ -16,6 +16,10 @@ pub struct Scan {
     pub angle_increment: f64,
     /// Time from one beam to the next; 0 when the whole scan has one time [s].
     pub time_increment: f64,
+    /// Time from one scan to the next, as the scanner states it [s]; None or 0 when it does not.
+    pub scan_time: Option<f64>,
+    /// Direction of the last beam, as the scanner states it [rad]; None when it does not.
+    pub angle_max: Option<f64>,
     /// Readings below this are no measurement [m].
     pub range_min: f64,
     /// Readings from here on mean "nothing in range" [m].

@@ -4,7 +4,7 @@ use maps::Pose;
 use nalgebra::Matrix3;
 use serde::{Deserialize, Serialize};
 
-use crate::{ScanFit, Stamp, Twist};
+use crate::{ScanFit, SensorFindings, Stamp, Twist};
 
 /// Why a message did not lead to an update. Each is counted by the caller.
 #[derive(
@@ -30,6 +30,9 @@ pub enum Dropped {
     /// There is no pose to start from: neither given nor searched for.
     #[error("no initial pose")]
     NotInitialized,
+    /// A scan with the readings of the one before, although the car has moved: the scanner or its driver hangs.
+    #[error("the scan repeats the one before")]
+    RepeatedScan,
 }
 
 /// What the localizer is doing.
@@ -101,6 +104,8 @@ pub struct Update {
     pub slip: f64,
     /// Odometry's yaw rate less the posterior's, over the last 0.3 s [rad/s].
     pub yaw_rate_residual: f64,
+    /// What is wrong with the sensors, and what was done about it.
+    pub sensors: SensorFindings,
     /// Why the pose may be wrong; None while nothing speaks against it.
     pub doubt: Option<Doubt>,
 }

@@ -224,6 +224,8 @@ mod tests {
                 angle_min: -0.2,
                 angle_increment: 0.15,
                 time_increment: 0.0,
+                scan_time: None,
+                angle_max: None,
                 range_min: 0.1,
                 range_max: 10.0,
                 ranges: vec![5.0; 4],

@@ -146,8 +146,8 @@ pub fn run(
                 let before = Instant::now();
                 let result = localizer.on_scan(scan);
                 let taken = before.elapsed();
-                if result.is_err() {
-                    monitor.on_refused_scan(arrival.log_time);
+                if let Err(cause) = result {
+                    monitor.on_refused_scan(arrival.log_time, cause);
                 }
                 result.map(|update| {
                     let true_pose = truth.at(update.stamp);

@@ -1,5 +1,7 @@
 //! The list of causes that goes with a state.
 
+use synpf::{SensorFinding, SensorFindings};
+
 use super::rules::Finding;
 use super::{Cause, CauseKind, Severity, State, Thresholds};
 use crate::statistics::finite;
@@ -18,6 +20,10 @@ pub(super) struct CauseSources<'a> {
     pub(super) pose_jump: Option<f64>,
     /// The localizer has given its pose up.
     pub(super) gave_up: bool,
+    /// For how long scans have repeated [s]; None while they do not.
+    pub(super) repeating: Option<f64>,
+    /// What the localizer has found to be wrong with its sensors.
+    pub(super) sensors: SensorFindings,
     /// The metrics that are over their limits.
     pub(super) findings: Vec<&'a Finding>,
 }
@@ -64,12 +70,25 @@ impl CauseSources<'_> {
             // The jump of the pose is in the list with its own limit.
             .filter(|finding| pose_jump.is_none() || finding.kind != CauseKind::Innovation)
             .map(|f| measured(f.kind, f.severity, f.value, f.limit));
+        let repeating = self.repeating.map(|seconds| Cause {
+            value: Some(finite(seconds)),
+            ..plain(CauseKind::RepeatedScans, Severity::Warning)
+        });
+        let sensors = self.sensors.iter().map(|(finding, value)| {
+            let (kind, severity) = of_sensor(finding);
+            Cause {
+                value: Some(finite(value)),
+                ..plain(kind, severity)
+            }
+        });
         let mut causes: Vec<Cause> = silent
             .chain(of_state(self.state, self.gave_up))
             .chain(refused)
             .chain(odometry_jump)
             .chain(pose_jump)
             .chain(findings)
+            .chain(repeating)
+            .chain(sensors)
             .collect();
         causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));
         causes
@@ -84,5 +103,30 @@ fn of_state(state: State, gave_up: bool) -> Option<Cause> {
         State::Relocalizing => Some(plain(CauseKind::Searching, Severity::Warning)),
         State::Lost if gave_up => Some(plain(CauseKind::Searching, Severity::Warning)),
         State::Localized | State::Degraded | State::Lost | State::Stale => None,
+    }
+}
+
+/// The cause that a finding of the localizer is, and how severe: what it corrects is information.
+fn of_sensor(finding: SensorFinding) -> (CauseKind, Severity) {
+    use Severity::{Info, Warning};
+    match finding {
+        SensorFinding::GyroInDegrees => (CauseKind::GyroInDegrees, Info),
+        SensorFinding::GyroFlipped => (CauseKind::GyroFlipped, Info),
+        SensorFinding::GyroBias => (CauseKind::GyroBias, Info),
+        SensorFinding::GyroIgnored => (CauseKind::GyroIgnored, Warning),
+        SensorFinding::GyroAlwaysZero => (CauseKind::GyroAlwaysZero, Warning),
+        SensorFinding::OdometryTurnScale => (CauseKind::OdometryTurnScale, Info),
+        SensorFinding::OdometryTurnBias => (CauseKind::OdometryTurnBias, Info),
+        SensorFinding::OdometryTurnWrong => (CauseKind::OdometryTurnWrong, Warning),
+        SensorFinding::TwistFromPose => (CauseKind::TwistFromPose, Info),
+        SensorFinding::PoseFromTwist => (CauseKind::PoseFromTwist, Info),
+        SensorFinding::WheelScale => (CauseKind::WheelScale, Info),
+        SensorFinding::Creep => (CauseKind::Creep, Info),
+        SensorFinding::WheelsSlide => (CauseKind::WheelsSlide, Warning),
+        SensorFinding::SweepFromScanTime => (CauseKind::SweepFromScanTime, Info),
+        SensorFinding::TimeIncrementWrong => (CauseKind::TimeIncrementWrong, Info),
+        SensorFinding::RangeMaxWrong => (CauseKind::RangeMaxWrong, Info),
+        SensorFinding::AngleIncrementMissing => (CauseKind::AngleIncrementMissing, Info),
+        SensorFinding::ScanLag => (CauseKind::ScanLag, Info),
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use localizer::ScanFit;
-use synpf::{Mode, Stamp, Update};
+use synpf::{Dropped, Mode, SensorFindings, Stamp, Update};
 
 use super::causes::CauseSources;
 use super::pose_ages::PoseAges;
@@ -54,6 +54,10 @@ pub struct Monitor {
     last_update: Option<Stamp>,
     /// Since when every scan has been refused, and when the last one was.
     refused: Option<[Stamp; 2]>,
+    /// Since when scans repeat.
+    repeating_since: Option<Stamp>,
+    /// What the localizer has found to be wrong with its sensors.
+    sensors: SensorFindings,
     ages: PoseAges,
     /// The last jump of the odometry: when, and how far [m].
     odometry_jump: Option<(Stamp, f64)>,
@@ -88,6 +92,8 @@ impl Monitor {
             driven: 0.0,
             last_update: None,
             refused: None,
+            repeating_since: None,
+            sensors: SensorFindings::default(),
             ages: PoseAges::default(),
             odometry_jump: None,
             pose_jump: None,
@@ -111,8 +117,16 @@ impl Monitor {
         self.silence.on_odometry(now);
     }
 
-    /// A scan came in at `now`, and the localizer refused it.
-    pub fn on_refused_scan(&mut self, now: Stamp) {
+    /// A scan came in at `now`, and the localizer refused it. One that repeats the scan before counts as none.
+    pub fn on_refused_scan(&mut self, now: Stamp, why: Dropped) {
+        if why == Dropped::RepeatedScan {
+            self.repeating_since.get_or_insert(now);
+            if self.verdict.state == State::Localized {
+                self.enter(State::Degraded, now);
+            }
+            self.verdict.causes = self.causes(self.silent(now), now);
+            return;
+        }
         self.silence.on_scan(now);
         let [first, _] = self.refused.unwrap_or([now; 2]);
         self.refused = Some([first, now]);
@@ -134,6 +148,8 @@ impl Monitor {
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.silence.on_scan(now);
         self.refused = None;
+        self.repeating_since = None;
+        self.sensors = update.sensors;
         if let Some([distance, _]) = update.odometry_jump {
             self.odometry_jump = Some((now, distance));
         }
@@ -343,6 +359,8 @@ impl Monitor {
             odometry_jump: recent(self.odometry_jump),
             pose_jump: recent(self.pose_jump),
             gave_up: self.gave_up,
+            repeating: self.repeating_since.map(|since| now.since(since)),
+            sensors: self.sensors,
             findings: self
                 .findings
                 .iter()
@@ -359,7 +377,7 @@ mod tests {
     use crate::health::tests_support::good_update;
     use localizer::Doubt;
     use maps::Pose;
-    use synpf::Twist;
+    use synpf::{SensorFinding, Twist};
 
     const SCAN: f64 = 0.025;
 
@@ -755,5 +773,38 @@ mod tests {
             kinds,
             [CauseKind::NoScan, CauseKind::NoOdometry, CauseKind::NoInitialPose]
         );
+    }
+
+    /// A hanging driver sends its last scan under new stamps: it was taken for a scan, and the pose for a good one.
+    #[test]
+    fn repeated_scans_degrade_at_once_and_are_stale_after_their_time() {
+        let mut drive = Drive::new();
+        drive.drive(2.0, |_| {});
+        assert_eq!(drive.monitor.verdict().state, State::Localized);
+        for scan in 0..40 {
+            drive.now = drive.now.plus(SCAN);
+            drive.monitor.on_odometry(drive.now);
+            drive.monitor.on_refused_scan(drive.now, Dropped::RepeatedScan);
+            drive.monitor.tick(drive.now);
+            let verdict = drive.monitor.verdict();
+            let said = |cause: &Cause| cause.kind == CauseKind::RepeatedScans;
+            assert!(verdict.causes.iter().any(said));
+            if scan < 10 {
+                assert_eq!(verdict.state, State::Degraded, "scan {scan}");
+            }
+        }
+        assert_eq!(drive.monitor.verdict().state, State::Stale);
+    }
+
+    #[test]
+    fn findings_of_the_sensors_are_causes_with_their_values() {
+        let mut drive = Drive::new();
+        drive.drive(0.1, |update| {
+            update.sensors.insert(SensorFinding::GyroInDegrees, 57.3);
+        });
+        let causes = &drive.monitor.verdict().causes;
+        let said: Vec<_> = causes.iter().map(ToString::to_string).collect();
+        let expected = "gyroscope in deg/s, converted: readings per rad/s 57.30";
+        assert!(said.contains(&expected.to_owned()), "{said:?}");
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, select};
 use maps::{Pose, Raceline};
-use protocol::{EventKind, Rates, SetRef};
+use protocol::{Cause, CauseKind, EventKind, Rates, SetRef};
 use synpf::{Dropped, Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, TrackMap, Update};
 
 use super::filter_command::{FilterCommand, LocalizerChange};
@@ -79,6 +79,8 @@ struct FilterWorker {
     last_state: State,
     last_odometry: Option<Pose>,
     listed: Listed,
+    /// Faults of sensors that an event was sent for.
+    announced: Vec<CauseKind>,
     tables: TableWorker,
     jobs: JobWorker,
 }
@@ -106,6 +108,7 @@ pub fn start(
             last_state,
             last_odometry: None,
             listed: Listed::default(),
+            announced: Vec::new(),
             tables,
             jobs,
         }
@@ -341,7 +344,7 @@ impl FilterWorker {
         let update = match result {
             Ok(update) => update,
             Err(cause) => {
-                self.config.monitor.on_refused_scan(now);
+                self.config.monitor.on_refused_scan(now, cause);
                 return Err(cause);
             }
         };
@@ -366,6 +369,7 @@ impl FilterWorker {
 
         self.config.monitor.on_update(&update, now);
         self.watch_slip(&update);
+        self.announce_findings();
         if self.paces.cloud.due(update.stamp, rates.cloud) {
             // Every n-th particle; their order has no meaning, so this is a fair sample.
             let particles = self.config.localizer.particles(protocol::Cloud::MAX_PARTICLES);
@@ -466,6 +470,21 @@ impl FilterWorker {
             && before.as_ref() != Some(&set)
         {
             self.event(EventKind::Proposed { set, evidence });
+        }
+    }
+
+    /// An event for each thing wrong with a sensor, the first time that it is a cause.
+    fn announce_findings(&mut self) {
+        let causes = &self.config.monitor.verdict().causes;
+        let new: Vec<Cause> = causes
+            .iter()
+            .filter(|cause| cause.kind.is_sensor_fault() && !self.announced.contains(&cause.kind))
+            .copied()
+            .collect();
+        for cause in new {
+            self.announced.push(cause.kind);
+            let text = cause.to_string();
+            self.event(EventKind::Warning { text });
         }
     }
 

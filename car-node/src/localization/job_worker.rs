@@ -114,6 +114,8 @@ mod tests {
             angle_min,
             angle_increment,
             time_increment: 0.0,
+            scan_time: None,
+            angle_max: None,
             range_min: 0.05,
             range_max: 20.0,
             ranges: (0..460)

@@ -340,6 +340,8 @@ impl CarRunner {
             angle_min: scan.angle_min,
             angle_increment: scan.angle_increment,
             time_increment: scan.time_increment,
+            scan_time: None,
+            angle_max: None,
             range_min: scan.range_min,
             range_max: scan.range_max,
             ranges: scan.ranges.clone(),
@@ -363,9 +365,12 @@ impl CarRunner {
                 .scanned(&message, pose, twist, truth, None, self.base_link_from_laser);
             return None;
         };
-        let Ok(update) = self.measurements.timed_update(|| localizer.on_scan(&message)) else {
-            monitor.on_refused_scan(now);
-            return None;
+        let update = match self.measurements.timed_update(|| localizer.on_scan(&message)) {
+            Ok(update) => update,
+            Err(cause) => {
+                monitor.on_refused_scan(now, cause);
+                return None;
+            }
         };
         let state = monitor.on_update(&update, now).state;
         self.measurements.judged(update.stamp, state, update.pose, truth);

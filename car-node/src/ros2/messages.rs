@@ -112,6 +112,8 @@ impl LaserScan {
             angle_min: sign * f64::from(self.angle_min),
             angle_increment: sign * f64::from(self.angle_increment),
             time_increment: f64::from(self.time_increment),
+            scan_time: Some(f64::from(self.scan_time)),
+            angle_max: Some(sign * f64::from(self.angle_max)),
             range_min: f64::from(self.range_min),
             range_max: f64::from(self.range_max),
             ranges: self.ranges.clone(),

@@ -196,6 +196,8 @@ fn feed(race: &Race, output: Output) -> Option<Feed> {
             angle_min: scan.angle_min,
             angle_increment: scan.angle_increment,
             time_increment: scan.time_increment,
+            scan_time: None,
+            angle_max: None,
             range_min: scan.range_min,
             range_max: scan.range_max,
             ranges: scan.ranges,

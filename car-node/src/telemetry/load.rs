@@ -102,7 +102,7 @@ impl Meter {
 fn drops(reading: &Reading, telemetry: u64) -> Drops {
     let of = |cause| reading.dropped.get(&cause).copied().unwrap_or(0);
     Drops {
-        malformed: of(Dropped::Malformed),
+        malformed: of(Dropped::Malformed) + of(Dropped::RepeatedScan),
         time_backwards: of(Dropped::TimeBackwards),
         no_odometry: of(Dropped::NoOdometry),
         stale_odometry: of(Dropped::StaleOdometry),

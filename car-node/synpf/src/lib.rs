@@ -77,6 +77,7 @@ mod reference;
 mod regions;
 mod resampling;
 mod scan_matcher;
+mod sensor_check;
 mod sensor_model;
 mod sensor_parameters;
 mod synpf;
@@ -91,8 +92,8 @@ pub use error::SetUpError;
 pub use global_search::{GlobalCheck, GlobalCheckOutcome, SearchParameters};
 pub use localizer::{
     Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
-    ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose,
-    YawRate,
+    ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, SensorFinding, SensorFindings,
+    Stamp, Twist, Update, WeightedPose, YawRate,
 };
 pub use motion_model::{MotionModel, MotionParameters};
 pub use parameters::{Parameters, parameter_table};

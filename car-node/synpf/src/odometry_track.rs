@@ -2,10 +2,11 @@
 
 use std::collections::VecDeque;
 
-use localizer::{Dropped, Odometry, Stamp, Twist, YawRate};
+use localizer::{Dropped, Odometry, SensorFindings, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::calibration::{Drive, SlipModel};
+use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, WheelGrip};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
 /// whoever reads it sees one smooth motion in a frame of its own. Whether a jump was one of the car, which was carried or
@@ -16,6 +17,14 @@ pub(crate) struct OdometryTrack {
     points: VecDeque<Odometry>,
     /// The same messages as they were received.
     received: VecDeque<Odometry>,
+    /// What the sensors have said until then, without corrections.
+    driven: VecDeque<DrivenSums>,
+    /// The last message, completed.
+    last: Option<Odometry>,
+    fields: OdometryFields,
+    grip: WheelGrip,
+    /// What the checks of the sensors have found.
+    pub(crate) corrections: Corrections,
     yaw_rates: VecDeque<YawRate>,
     /// The wheels' speed as it came [m/s], over the last [`ACCELERATING`].
     speeds: VecDeque<(Stamp, f64)>,
@@ -38,6 +47,9 @@ const JUMP_RATE: [f64; 2] = [3.0, 3.0];
 
 /// After a gap of so long [s] the pose says where the car has gone, and not the twist, if it can have gone so far.
 const GAP: f64 = 0.5;
+
+/// Wheels that turn faster than this do not creep [m/s].
+const SLOW: f64 = 0.3;
 
 /// A gyroscope is silent when its last reading is older than this [s].
 const GYRO_SILENT: f64 = 0.1;
@@ -91,9 +103,9 @@ impl OdometryTrack {
             angular,
         } = odometry.twist;
         let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
-        // Faster than any car of this kind: a broken driver, and no use to the filter.
-        let sound = odometry.pose.is_finite()
-            && sane(odometry.pose.x, 1e7)
+        // Faster than any car of this kind: a broken driver, and no use to the filter. A heading that is not finite is an
+        // orientation that nobody has set.
+        let sound = sane(odometry.pose.x, 1e7)
             && sane(odometry.pose.y, 1e7)
             && sane(linear_x, 100.0)
             && sane(linear_y, 100.0)
@@ -101,14 +113,21 @@ impl OdometryTrack {
         if !sound {
             return Err(Dropped::Malformed);
         }
-        let Some(&last) = self.received.back() else {
-            self.received.push_back(*odometry);
-            self.points.push_back(*odometry);
-            return Ok(());
-        };
-        if odometry.stamp <= last.stamp {
+        if self
+            .received
+            .back()
+            .is_some_and(|last| odometry.stamp <= last.stamp)
+        {
             return Err(Dropped::TimeBackwards);
         }
+        let received = *odometry;
+        let odometry = self.fields.completed(odometry);
+        let Some(last) = self.last.replace(odometry) else {
+            self.received.push_back(received);
+            self.points.push_back(odometry);
+            self.driven.push_back(DrivenSums::default());
+            return Ok(());
+        };
         let dt = odometry.stamp.since(last.stamp);
         let mut step = odometry.pose.since(last.pose);
         let expected = Pose::exp(mean_twist(&last.twist, &odometry.twist).map(|v| v * dt.min(1.0)));
@@ -125,25 +144,16 @@ impl OdometryTrack {
             self.discontinuity = Some(self.discontinuity.map_or(jump, |earlier| earlier * jump));
             step = expected;
         }
-        let mut arc = step.log();
-        if use_imu && let Some(turn) = self.turn_by_gyro(last.stamp, odometry.stamp) {
-            // The same arc, turned by the gyroscope.
-            arc[2] = turn;
-        }
+        let gyro = self.turn_by_gyro(last.stamp, odometry.stamp);
+        let (arc, twist) = self.corrected(&odometry, step.log(), gyro.filter(|_| use_imu), dt);
+        self.note_driven(step.log(), gyro, dt);
         self.drive = Drive {
-            acceleration: self.acceleration(odometry),
-            lateral: odometry.twist.linear_x * arc[2] / dt,
+            acceleration: self.acceleration(odometry.stamp, twist[0]),
+            lateral: twist[0] * arc[2] / dt,
         };
         let step = Pose::exp(slip.corrected(arc, self.drive));
-        let [linear_x, linear_y, angular] = slip.corrected(
-            [
-                odometry.twist.linear_x,
-                odometry.twist.linear_y,
-                odometry.twist.angular,
-            ],
-            self.drive,
-        );
-        self.received.push_back(*odometry);
+        let [linear_x, linear_y, angular] = slip.corrected(twist, self.drive);
+        self.received.push_back(received);
         self.points.push_back(Odometry {
             pose: before * step,
             twist: Twist {
@@ -151,13 +161,106 @@ impl OdometryTrack {
                 linear_y,
                 angular,
             },
-            ..*odometry
+            ..odometry
         });
         if self.points.len() > KEPT {
             self.points.pop_front();
             self.received.pop_front();
+            self.driven.pop_front();
         }
         Ok(())
+    }
+
+    /// A step of odometry, as an arc, and its twist, corrected by what is known of the sensors. `gyro` is the gyroscope's turn.
+    fn corrected(
+        &mut self,
+        odometry: &Odometry,
+        mut arc: [f64; 3],
+        gyro: Option<f64>,
+        dt: f64,
+    ) -> ([f64; 3], [f64; 3]) {
+        let Corrections {
+            gyro: gyro_correction,
+            turn,
+            wheel_scale,
+            standing,
+        } = self.corrections;
+        let Twist {
+            linear_x,
+            linear_y,
+            angular,
+        } = odometry.twist;
+        let mut twist = [linear_x * wheel_scale, linear_y * wheel_scale, angular];
+        twist[2] = turn.corrected(angular, 1.0);
+        arc = [
+            arc[0] * wheel_scale,
+            arc[1] * wheel_scale,
+            turn.corrected(arc[2], dt),
+        ];
+        if let Some(reading) = gyro
+            && let Some(correction) = gyro_correction
+        {
+            // The same arc, turned by the gyroscope.
+            arc[2] = correction.corrected(reading, dt);
+        }
+        let speed = self.grip.speed(odometry.stamp, twist[0]);
+        if self.grip.is_sliding() {
+            arc[0] = speed * dt;
+            twist[0] = speed;
+        }
+        if standing && linear_x.abs() < SLOW {
+            (arc, twist) = ([0.0; 3], [0.0; 3]);
+        }
+        (arc, twist)
+    }
+
+    /// Adds a step, as an arc, to what the sensors have said.
+    fn note_driven(&mut self, [x, _, turn]: [f64; 3], gyro: Option<f64>, dt: f64) {
+        let sums = self.driven_sums();
+        self.driven.push_back(DrivenSums {
+            distance: sums.distance + x,
+            turn: sums.turn + turn,
+            gyro_turn: sums.gyro_turn + gyro.unwrap_or(0.0),
+            gyro_time: sums.gyro_time + gyro.map_or(0.0, |_| dt),
+            sliding: sums.sliding + if self.grip.is_sliding() { dt } else { 0.0 },
+        });
+    }
+
+    /// What the sensors have said until the last message.
+    pub(crate) fn driven_sums(&self) -> DrivenSums {
+        self.driven.back().copied().unwrap_or_default()
+    }
+
+    /// What the sensors have said until a stamp; None where odometry does not cover it.
+    pub(crate) fn driven_until(&self, stamp: Stamp) -> Option<DrivenSums> {
+        let after = self.points.partition_point(|point| point.stamp <= stamp);
+        let before = after.checked_sub(1)?;
+        let (a, sums) = (self.points[before].stamp, &self.driven[before]);
+        match self.points.get(after) {
+            Some(b) => Some(sums.interpolate(&self.driven[after], stamp.since(a) / b.stamp.since(a))),
+            None => (a == stamp).then_some(*sums),
+        }
+    }
+
+    /// Speed of the wheels by the last message [m/s].
+    pub(crate) fn wheel_speed(&self) -> f64 {
+        self.last.map_or(0.0, |last| last.twist.linear_x)
+    }
+
+    /// Whether the wheels slide, so that the car's own speed is carried on.
+    pub(crate) fn wheels_slide(&self) -> bool {
+        self.grip.is_sliding()
+    }
+
+    /// The scans say that the car drives at `speed` [m/s]; `share` of it is to be believed. Counts while the wheels slide.
+    pub(crate) fn correct_speed(&mut self, speed: f64, share: f64) {
+        self.grip.correct(speed, share);
+    }
+
+    /// Adds what is wrong with odometry.
+    pub(crate) fn report(&self, findings: &mut SensorFindings) {
+        self.fields.report(findings);
+        self.grip.report(findings);
     }
 
     pub(crate) fn push_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
@@ -189,9 +292,8 @@ impl OdometryTrack {
         self.drive
     }
 
-    /// Notes the wheels' speed and returns their acceleration [m/s^2].
-    fn acceleration(&mut self, odometry: &Odometry) -> f64 {
-        let (now, speed) = (odometry.stamp, odometry.twist.linear_x);
+    /// Notes the wheels' speed [m/s] and returns their acceleration [m/s^2].
+    fn acceleration(&mut self, now: Stamp, speed: f64) -> f64 {
         self.speeds.push_back((now, speed));
         while self
             .speeds
@@ -333,6 +435,8 @@ mod tests {
     #[test]
     fn the_gyroscope_turns_the_car_where_odometry_does_not() {
         let mut track = OdometryTrack::default();
+        // It is known to be sound.
+        track.corrections.gyro = Some(crate::sensor_check::TurnCorrection::default());
         for i in 0..=50 {
             track
                 .push_yaw_rate(&YawRate {

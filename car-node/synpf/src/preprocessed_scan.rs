@@ -5,6 +5,7 @@ use maps::Pose;
 use crate::beam_layout::{BeamParameters, chosen_beams};
 use crate::calibration::Slip;
 use crate::odometry_track::OdometryTrack;
+use crate::sensor_check::ScanGeometry;
 use crate::{Dropped, Scan};
 
 /// One beam at the scan's stamp.
@@ -45,17 +46,20 @@ const MOST_BEAMS: usize = 14_400;
 /// The sweep is deskewed in this many segments. Within a segment the motion counts as uniform.
 const SEGMENTS: usize = 8;
 
+/// Odometry is carried on beyond its last message by the length of the sweep and this [s].
+const CARRIED: f64 = 0.1;
+
 /// Marks a beam without a return.
 const NO_POINT: u32 = u32::MAX;
 
 impl PreprocessedScan {
-    /// Loads a scan. Its beams are transformed to the stamp by odometry, corrected by `slip`.
+    /// Loads a scan, read by `geometry`. Its beams are transformed to the stamp by odometry, corrected by `slip`.
     ///
     /// Readings that are not finite, below `range_min`, or from `range_max` or `max_range` on count as no return. A scan may
     /// differ in geometry from the one before.
     pub(crate) fn load(
         &mut self,
-        scan: &Scan,
+        (scan, geometry): (&Scan, &ScanGeometry),
         track: &OdometryTrack,
         slip: Slip,
         base_link_from_laser: Pose,
@@ -63,24 +67,24 @@ impl PreprocessedScan {
         parameters: &BeamParameters,
     ) -> Result<(), Dropped> {
         let count = scan.ranges.len();
-        let sweep = scan.time_increment * count as f64;
+        let sweep = geometry.time_increment * count as f64;
         let sound = (1..=MOST_BEAMS).contains(&count)
             && scan.angle_min.is_finite()
             && scan.angle_min.abs() < 100.0
-            && scan.angle_increment.is_finite()
-            && scan.angle_increment.abs() > 1e-6
-            && (scan.angle_increment * (count - 1) as f64).abs() < 6.5
+            && geometry.angle_increment.is_finite()
+            && geometry.angle_increment.abs() > 1e-6
+            && (geometry.angle_increment * (count - 1) as f64).abs() < 6.5
             && sweep.is_finite()
             && (0.0..1.0).contains(&sweep)
             && !scan.range_min.is_nan()
-            && !scan.range_max.is_nan();
+            && !geometry.range_max.is_nan();
         if !sound {
             return Err(Dropped::Malformed);
         }
-        self.choose(scan, parameters);
+        self.choose(scan, geometry, parameters);
         self.base_link_from_laser = base_link_from_laser;
         let nearest = (scan.range_min as f32).max(0.01);
-        let farthest = scan.range_max.min(max_range) as f32;
+        let farthest = geometry.range_max.min(max_range) as f32;
 
         self.points.clear();
         self.beam_of.clear();
@@ -89,14 +93,16 @@ impl PreprocessedScan {
         let deskew = parameters.deskew && sweep > 1e-4;
         let segment = if deskew { count.div_ceil(SEGMENTS) } else { count };
         let (mut begin, mut start) = (0, base_link_from_laser);
-        let at_stamp = track.at(scan.stamp, sweep + 0.1).map(|(pose, _)| pose.inverse());
+        // By odometry's clock.
+        let stamp = scan.stamp.plus(-geometry.lag);
+        let at_stamp = track.at(stamp, sweep + CARRIED).map(|(pose, _)| pose.inverse());
         while begin < count {
             let end = (begin + segment).min(count);
             // The laser's pose at the end of the segment, seen from base_link at the scan's stamp.
             let finish = match at_stamp {
                 Some(from_odom) if deskew => {
-                    let seconds = scan.time_increment * end as f64;
-                    let moved = track.at(scan.stamp.plus(seconds), sweep + 0.1);
+                    let seconds = geometry.time_increment * end as f64;
+                    let moved = track.at(stamp.plus(seconds), sweep + CARRIED);
                     moved.map_or(start, |(pose, _)| {
                         slip.corrected(from_odom * pose, seconds) * base_link_from_laser
                     })
@@ -199,33 +205,34 @@ impl PreprocessedScan {
     }
 
     /// Computes the directions and the choice of beams again if the scanner's geometry has changed.
-    fn choose(&mut self, scan: &Scan, parameters: &BeamParameters) {
-        let geometry = (
+    fn choose(&mut self, scan: &Scan, geometry: &ScanGeometry, parameters: &BeamParameters) {
+        let key = (
             scan.ranges.len(),
             scan.angle_min,
-            scan.angle_increment,
+            geometry.angle_increment,
             parameters.clone(),
         );
-        if self.geometry.as_ref() == Some(&geometry) {
+        if self.geometry.as_ref() == Some(&key) {
             return;
         }
-        let angle = |i: usize| scan.angle_min + scan.angle_increment * i as f64;
+        let angle = |i: usize| scan.angle_min + geometry.angle_increment * i as f64;
         self.directions.clear();
         self.directions
             .extend((0..scan.ranges.len()).map(|i| [angle(i).cos() as f32, angle(i).sin() as f32]));
         self.chosen = chosen_beams(
             scan.ranges.len(),
             scan.angle_min,
-            scan.angle_increment,
+            geometry.angle_increment,
             parameters,
         );
-        self.geometry = Some(geometry);
+        self.geometry = Some(key);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor_check::SensorCheck;
     use crate::{Odometry, Stamp, Twist};
     use std::f64::consts::PI;
 
@@ -237,6 +244,8 @@ mod tests {
             angle_min: -0.75 * PI,
             angle_increment: 1.5 * PI / (COUNT - 1) as f64,
             time_increment: 0.018_75 / (COUNT - 1) as f64,
+            scan_time: None,
+            angle_max: None,
             range_min: 0.06,
             range_max: 30.0,
             ranges,
@@ -271,7 +280,7 @@ mod tests {
         let mut preprocessed = PreprocessedScan::default();
         preprocessed
             .load(
-                scan,
+                (scan, &SensorCheck::default().geometry(scan)),
                 track,
                 Slip::default(),
                 Pose::new(0.27, 0.0, 0.0),

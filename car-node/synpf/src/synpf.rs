@@ -2,6 +2,7 @@
 //!
 //! [`SynPf::on_scan`] is the algorithm; each step of it is a function below it.
 
+mod sensor_hooks;
 pub(crate) mod stages;
 
 use std::sync::Arc;
@@ -25,6 +26,7 @@ use crate::particle_filter::{ParticleFilter, Weighted};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
 use crate::recovery::{Decision, Evidence, Recovery};
+use crate::sensor_check::SensorCheck;
 use crate::track_map::TrackMap;
 use crate::tracker::{Tracker, Uncertainty, fit_scan};
 use crate::tuning::Tuning;
@@ -39,6 +41,9 @@ pub struct SynPf {
     parameters: Parameters,
     odometry: OdometryTrack,
     scan: PreprocessedScan,
+    /// The same, read as a sweep while it is not known whether it is one; empty otherwise.
+    as_sweep: PreprocessedScan,
+    sensors: SensorCheck,
     filter: ParticleFilter,
     tracker: Tracker,
     calibration: Calibration,
@@ -102,6 +107,8 @@ impl SynPf {
             base_link_from_laser,
             odometry: OdometryTrack::default(),
             scan: PreprocessedScan::default(),
+            as_sweep: PreprocessedScan::default(),
+            sensors: SensorCheck::default(),
             filter: ParticleFilter::new(seed, parameters.particles.max_particles, sensor_model),
             tracker: Tracker::unknown(&map),
             calibration: Calibration::default(),
@@ -135,15 +142,11 @@ impl SynPf {
         if scan.stamp.since(latest) > CARRY {
             return Err(Dropped::StaleOdometry);
         }
-        let (odom, twist) = self.odometry.at(scan.stamp, CARRY).ok_or(Dropped::NoOdometry)?;
-        self.scan.load(
-            scan,
-            &self.odometry,
-            self.calibration.slip,
-            self.base_link_from_laser,
-            self.parameters.sensor.max_range,
-            &self.parameters.beams,
-        )?;
+        let geometry = self.check_scan(scan)?;
+        // By odometry's clock.
+        let stamp = scan.stamp.plus(-geometry.lag);
+        let (odom, twist) = self.odometry.at(stamp, CARRY).ok_or(Dropped::NoOdometry)?;
+        self.load_scan(scan, &geometry)?;
         self.last_scan = Some(scan.stamp);
         let (before, odom_before) = self.tracker.at.unwrap_or((scan.stamp, odom));
         // A pose that was just set is true at the latest odometry, and the next scan was taken before that.
@@ -158,7 +161,7 @@ impl SynPf {
         Ok(Step {
             stamp: scan.stamp,
             seconds: seconds.abs(),
-            sweep: scan.time_increment * scan.ranges.len() as f64,
+            sweep: geometry.time_increment * scan.ranges.len() as f64,
             odom,
             twist,
             motion: odom.since(odom_before),
@@ -173,7 +176,8 @@ impl SynPf {
         let parameters = &self.parameters;
         let calibration = &mut self.calibration;
         let factor = noise_factor(seconds, calibration, parameters.motion.adaptive);
-        let sliding = calibration.slip_model.spinning().then(|| calibration.speed());
+        let slides = calibration.slip_model.spinning() || self.odometry.wheels_slide();
+        let sliding = slides.then(|| calibration.speed());
         let uncertainty = Uncertainty { factor, sliding };
         let mut predicted = self
             .tracker
@@ -235,7 +239,7 @@ impl SynPf {
 
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
-        if learns_slip(parameters) && fit.from_prediction {
+        if learns_slip(parameters) && fit.from_prediction && !self.odometry.wheels_slide() {
             calibration.slip_model.learn(predicted, &estimate);
         } else {
             calibration.slip_model.forget_pose();
@@ -249,6 +253,7 @@ impl SynPf {
             0.0
         };
         calibration.learn_walls(field, points, &estimate, step.motion.x, distance);
+        self.learn_sensors(step, predicted, moved);
         refined.then(|| estimate.pose.since(predicted.pose))
     }
 
@@ -288,6 +293,7 @@ impl SynPf {
             Decision::Searching(best) => {
                 self.mode = Mode::Searching;
                 self.calibration.forget_pose();
+                self.sensors.forget_pose();
                 match best {
                     Some(best) => self.tracker.set(best),
                     None => self.tracker.forget(&self.map),
@@ -367,6 +373,7 @@ impl SynPf {
                 probability: doubt.probability,
                 rival: doubt.rival.map(|pose| map_from_grid * pose),
             }),
+            sensors: self.sensor_findings(),
         }
     }
 
@@ -406,6 +413,7 @@ impl SynPf {
             .scatter(self.parameters.particles.max_particles, cloud);
         self.recovery.follow();
         self.calibration.forget_pose();
+        self.sensors.forget_pose();
     }
 
     /// Forgets the pose and searches the whole map with the next scans. The last pose stays in the updates until a candidate
@@ -415,6 +423,7 @@ impl SynPf {
         self.tracker.forget(&self.map);
         self.recovery.start_search();
         self.calibration.forget_pose();
+        self.sensors.forget_pose();
     }
 
     /// The poses that a search under way has found, best first; empty when none is.

@@ -506,6 +506,8 @@ fn any_message() -> impl Strategy<Value = Message> {
             angle_min: v[0],
             angle_increment: v[1] * 0.01,
             time_increment: v[2].abs() * 1e-6,
+            scan_time: Some(v[3]),
+            angle_max: Some(v[4]),
             range_min: v[3],
             range_max: v[4].abs() * 10.0,
             ranges,

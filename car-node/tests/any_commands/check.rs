@@ -514,6 +514,8 @@ impl Car {
             angle_min: -2.3,
             angle_increment: 0.023,
             time_increment: 0.0,
+            scan_time: None,
+            angle_max: None,
             range_min: 0.05,
             range_max: 30.0,
             ranges: vec![1.0; 200],

@@ -28,7 +28,7 @@ pub struct Health {
 
 impl Health {
     /// Most causes in one message.
-    pub const MAX_CAUSES: usize = 32;
+    pub const MAX_CAUSES: usize = 64;
 }
 
 /// How far the car can rely on its pose.
@@ -124,6 +124,44 @@ pub enum CauseKind {
     Searching,
     /// Odometry has jumped: it restarted, or the car was carried.
     OdometryJump,
+    /// The gyroscope reports deg/s and is converted.
+    GyroInDegrees,
+    /// The gyroscope turns the wrong way and is corrected.
+    GyroFlipped,
+    /// The gyroscope has a bias, which is taken out.
+    GyroBias,
+    /// The gyroscope does not follow the turn of the scans and is left out.
+    GyroIgnored,
+    /// The gyroscope reads zero while the car turns and is left out.
+    GyroAlwaysZero,
+    /// Odometry turns too far or too little and is corrected.
+    OdometryTurnScale,
+    /// Odometry's yaw rate has a bias, which is taken out.
+    OdometryTurnBias,
+    /// Odometry's turn does not follow the turn of the scans.
+    OdometryTurnWrong,
+    /// Odometry's twist is missing or wrong and derived from its pose.
+    TwistFromPose,
+    /// Odometry's pose is missing and integrated from its twist.
+    PoseFromTwist,
+    /// Odometry's distance is off by a factor and corrected.
+    WheelScale,
+    /// Odometry moves while the scans stand still and is held.
+    Creep,
+    /// Wheels lock or spin beyond what tyres can do.
+    WheelsSlide,
+    /// The scan has no time increment; it is taken from its scan time.
+    SweepFromScanTime,
+    /// The scan's time increment is as long as a scan and is corrected.
+    TimeIncrementWrong,
+    /// The scan's largest range is no range and is replaced.
+    RangeMaxWrong,
+    /// The scan has no angle increment; it is taken from its first and last beam.
+    AngleIncrementMissing,
+    /// The scans' stamps are late against odometry's; it is corrected.
+    ScanLag,
+    /// Scans repeat under new stamps: the scanner or its driver hangs.
+    RepeatedScans,
 }
 
 impl CauseKind {
@@ -151,7 +189,31 @@ impl CauseKind {
             Self::BadSensorData => "bad sensor data",
             Self::Searching => "searching the whole map",
             Self::OdometryJump => "odometry jump",
+            Self::GyroInDegrees => "gyroscope in deg/s, converted: readings per rad/s",
+            Self::GyroFlipped => "gyroscope flipped, corrected: readings per rad/s",
+            Self::GyroBias => "gyroscope's bias, taken out",
+            Self::GyroIgnored => "gyroscope left out, fits the turn neither way: share explained",
+            Self::GyroAlwaysZero => "gyroscope left out, always zero",
+            Self::OdometryTurnScale => "odometry's turn scaled, corrected: times",
+            Self::OdometryTurnBias => "odometry's yaw rate has a bias, taken out",
+            Self::OdometryTurnWrong => "odometry's turn fits the scans neither way: share explained",
+            Self::TwistFromPose => "odometry's twist is zero or wrong, taken from its pose: times",
+            Self::PoseFromTwist => "odometry's pose is missing, taken from its twist after",
+            Self::WheelScale => "odometry's distance scaled, corrected: times",
+            Self::Creep => "odometry creeps at standstill, held",
+            Self::WheelsSlide => "wheels lock or spin, off by",
+            Self::SweepFromScanTime => "time_increment missing, taken from scan_time: sweep",
+            Self::TimeIncrementWrong => "time_increment is as long as a scan, corrected",
+            Self::RangeMaxWrong => "range_max is no range, replaced",
+            Self::AngleIncrementMissing => "angle_increment missing, taken from angle_min and angle_max",
+            Self::ScanLag => "scan stamps late against odometry, corrected",
+            Self::RepeatedScans => "scans repeat: scanner hangs, for",
         }
+    }
+
+    /// Whether it names a fault of a sensor that the car has found and works around.
+    pub fn is_sensor_fault(self) -> bool {
+        self as u32 >= Self::GyroInDegrees as u32 && self as u32 <= Self::RepeatedScans as u32
     }
 
     /// The unit of its value.
@@ -161,9 +223,19 @@ impl CauseKind {
             | Self::SpreadAlong
             | Self::SpreadAcross
             | Self::Innovation
-            | Self::OdometryJump => "m",
-            Self::YawRate => "rad/s",
-            Self::Age | Self::NoScan | Self::NoOdometry => "s",
+            | Self::OdometryJump
+            | Self::PoseFromTwist
+            | Self::RangeMaxWrong => "m",
+            Self::YawRate | Self::GyroBias | Self::OdometryTurnBias => "rad/s",
+            Self::Creep | Self::WheelsSlide => "m/s",
+            Self::AngleIncrementMissing => "rad",
+            Self::Age
+            | Self::NoScan
+            | Self::NoOdometry
+            | Self::SweepFromScanTime
+            | Self::TimeIncrementWrong
+            | Self::ScanLag
+            | Self::RepeatedScans => "s",
             _ => "",
         }
     }

@@ -60,7 +60,7 @@ pub struct Latency {
 /// Messages dropped since the node started, by cause.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Drops {
-    /// Sensor messages with NaN, infinities or an impossible geometry.
+    /// Sensor messages with NaN, infinities or an impossible geometry, and scans that repeat the one before.
     pub malformed: u64,
     /// Sensor messages not later than the last one of their kind.
     pub time_backwards: u64,

@@ -124,6 +124,8 @@ fn older<M: Message>(version: u16, payload: &str) -> M {
 #[test]
 fn health_of_version_1_is_read() {
     let mut expected = samples::health(State::Degraded);
+    // The causes of sensors came later.
+    expected.causes.truncate(21);
     let last = expected.causes.pop().map(|cause| cause.kind);
     assert_eq!(
         last,

@@ -24,7 +24,7 @@ const RATES: Rates = Rates {
 };
 pub(crate) const ID: CommandId = CommandId(0x0102_0304_0506_0708_090a_0b0c_0d0e_0f10);
 
-pub(crate) const CAUSE_KINDS: [CauseKind; 21] = [
+pub(crate) const CAUSE_KINDS: [CauseKind; 40] = [
     CauseKind::NoInitialPose,
     CauseKind::NewPose,
     CauseKind::Alignment,
@@ -46,6 +46,25 @@ pub(crate) const CAUSE_KINDS: [CauseKind; 21] = [
     CauseKind::BadSensorData,
     CauseKind::Searching,
     CauseKind::OdometryJump,
+    CauseKind::GyroInDegrees,
+    CauseKind::GyroFlipped,
+    CauseKind::GyroBias,
+    CauseKind::GyroIgnored,
+    CauseKind::GyroAlwaysZero,
+    CauseKind::OdometryTurnScale,
+    CauseKind::OdometryTurnBias,
+    CauseKind::OdometryTurnWrong,
+    CauseKind::TwistFromPose,
+    CauseKind::PoseFromTwist,
+    CauseKind::WheelScale,
+    CauseKind::Creep,
+    CauseKind::WheelsSlide,
+    CauseKind::SweepFromScanTime,
+    CauseKind::TimeIncrementWrong,
+    CauseKind::RangeMaxWrong,
+    CauseKind::AngleIncrementMissing,
+    CauseKind::ScanLag,
+    CauseKind::RepeatedScans,
 ];
 
 pub(crate) const STATES: [State; 7] = [

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
-    ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose, YawRate,
+    ParameterValues, PoseError, PreparedParameters, Scan, SensorFindings, Stamp, Twist, Update, WeightedPose,
+    YawRate,
 };
 use maps::{Cell, Pose};
 use nalgebra::{Matrix3, Vector3};
@@ -407,6 +408,7 @@ impl Reference {
             slip: 0.0,
             yaw_rate_residual: 0.0,
             doubt: None,
+            sensors: SensorFindings::default(),
         }
     }
 }

@@ -49,8 +49,9 @@ impl SynPf {
         let estimate = &self.tracker.estimate;
         match stage {
             Stage::Preprocess => {
+                let geometry = self.sensors.geometry(scan);
                 let loaded = self.scan.load(
-                    scan,
+                    (scan, &geometry),
                     &self.odometry,
                     self.calibration.slip,
                     self.base_link_from_laser,

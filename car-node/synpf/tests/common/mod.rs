@@ -88,6 +88,8 @@ pub(crate) fn scan(map: &TrackMap, seconds: f64) -> Scan {
         angle_min: -0.75 * PI,
         angle_increment: increment,
         time_increment: 0.0,
+        scan_time: None,
+        angle_max: None,
         range_min: 0.02,
         range_max: 30.0,
         ranges: ranges.collect(),

@@ -1,0 +1,253 @@
+//! Odometry of which one half is missing: a twist of zeros beside a pose that moves, or a pose of zeros beside a twist.
+
+use std::collections::VecDeque;
+
+use localizer::{Odometry, SensorFinding, SensorFindings, Stamp, Twist};
+use maps::Pose;
+
+/// Completes odometry by what the other half says.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct OdometryFields {
+    /// The last message as it came.
+    last: Option<Odometry>,
+    /// Where the pose that is passed on is.
+    pose: Pose,
+    /// Distance by the pose and by the twist, the older stretches forgotten [m].
+    by_pose: f64,
+    by_twist: f64,
+    /// The pose does not move, or has no orientation.
+    no_pose: bool,
+    /// Distance by the twist while the pose stood still [m].
+    still: f64,
+    /// The twist is zero, or does not fit the pose: what it says of the distance.
+    wrong_twist: Option<f64>,
+    /// Some twist was not zero.
+    twist_seen: bool,
+    /// Recent poses.
+    poses: VecDeque<(Stamp, Pose)>,
+}
+
+/// A pose that stands still while the twist goes so far is missing [m]: at the origin, where a publisher that never sets it
+/// leaves it, and elsewhere, where it may be coarse.
+const STILL: [f64; 2] = [0.05, 0.6];
+
+/// How far the pose must go to judge the twist [m].
+const MOVED: f64 = 0.2;
+
+/// Distances are compared over this [m].
+const MEMORY: f64 = 2.0;
+
+/// A twist that says more or less than this many times the pose's distance is wrong: both come from the same wheels.
+const FITS: std::ops::Range<f64> = 0.6..1.6;
+
+/// A twist is derived from poses so far apart [s]: shorter is noise, longer is late.
+const SPAN: f64 = 0.045;
+
+/// A step by the pose beyond this speed is a jump [m/s].
+const FASTEST: f64 = 30.0;
+
+/// No message for so long: what the twist was in between is unknown [s].
+const GAP: f64 = 0.5;
+
+impl OdometryFields {
+    /// The message with a pose and a twist. The heading may come as NaN: no orientation.
+    pub(crate) fn completed(&mut self, message: &Odometry) -> Odometry {
+        let received = *message;
+        let Some(last) = self.last.replace(received) else {
+            let mut pose = message.pose;
+            if !pose.heading.is_finite() {
+                self.no_pose = true;
+                pose.heading = 0.0;
+            }
+            self.pose = pose;
+            self.poses.push_back((message.stamp, pose));
+            return Odometry { pose, ..received };
+        };
+        let dt = message.stamp.since(last.stamp);
+        let Twist {
+            linear_x,
+            linear_y,
+            angular,
+        } = message.twist;
+        let mean = [
+            f64::midpoint(last.twist.linear_x, linear_x),
+            f64::midpoint(last.twist.linear_y, linear_y),
+            f64::midpoint(last.twist.angular, angular),
+        ];
+        self.twist_seen |= linear_x != 0.0 || linear_y != 0.0 || angular != 0.0;
+        let by_twist = mean[0].hypot(mean[1]) * dt.min(GAP);
+        let same = |a: f64, b: f64| a.to_bits() == b.to_bits() || a == b;
+        let stood = same(message.pose.x, last.pose.x)
+            && same(message.pose.y, last.pose.y)
+            && same(message.pose.heading, last.pose.heading);
+        let oriented = message.pose.heading.is_finite() && last.pose.heading.is_finite();
+        if stood || !oriented {
+            self.still += by_twist;
+            let origin = message.pose.x == 0.0 && message.pose.y == 0.0;
+            self.no_pose |= !oriented || self.still > STILL[usize::from(!origin)];
+        } else {
+            self.no_pose = false;
+            self.still = 0.0;
+        }
+        if self.no_pose {
+            self.pose = self.pose * Pose::exp(mean.map(|v| v * dt.min(GAP)));
+            self.wrong_twist = None;
+            return Odometry {
+                pose: self.pose,
+                ..received
+            };
+        }
+        self.pose = message.pose;
+        let step = message.pose.since(last.pose);
+        let distance = step.x.hypot(step.y);
+        if distance < FASTEST * dt && dt < GAP {
+            self.judge_twist(distance * step.x.signum(), mean[0] * dt);
+        }
+        self.poses.push_back((message.stamp, message.pose));
+        while self
+            .poses
+            .get(1)
+            .is_some_and(|(stamp, _)| message.stamp.since(*stamp) >= SPAN)
+        {
+            self.poses.pop_front();
+        }
+        if self.wrong_twist.is_none() {
+            return received;
+        }
+        let (then, before) = self.poses[0];
+        let seconds = message.stamp.since(then);
+        let arc = message.pose.since(before).log();
+        let possible = seconds < GAP && arc[0].hypot(arc[1]) < FASTEST * seconds;
+        let [linear_x, linear_y, angular] = if possible {
+            arc.map(|v| v / seconds)
+        } else {
+            [0.0; 3]
+        };
+        Odometry {
+            twist: Twist {
+                linear_x,
+                linear_y,
+                angular,
+            },
+            ..received
+        }
+    }
+
+    /// Compares the distances of one step [m].
+    fn judge_twist(&mut self, by_pose: f64, by_twist: f64) {
+        let keep = (-by_pose.abs() / MEMORY).exp();
+        // Forwards as the pose goes.
+        self.by_pose = self.by_pose * keep + by_pose.abs();
+        self.by_twist = self.by_twist * keep + by_twist * by_pose.signum();
+        if self.by_pose > MOVED {
+            let ratio = self.by_twist / self.by_pose;
+            // A twist that has never been anything but zero is none; one that differs is judged over a longer way.
+            let judged = !self.twist_seen || self.by_pose > 0.5 * MEMORY;
+            if judged {
+                self.wrong_twist = (!FITS.contains(&ratio)).then_some(ratio);
+            }
+        }
+    }
+
+    pub(crate) fn report(&self, findings: &mut SensorFindings) {
+        if let Some(ratio) = self.wrong_twist {
+            findings.insert(SensorFinding::TwistFromPose, ratio);
+        }
+        if self.no_pose {
+            findings.insert(SensorFinding::PoseFromTwist, self.still);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two seconds of a circle of 2 m at 4 m/s, 50 Hz, each message changed; the last as it was and as it is completed.
+    fn circle(change: impl Fn(&mut Odometry)) -> (Odometry, Odometry, OdometryFields) {
+        let mut fields = OdometryFields::default();
+        let twist = Twist {
+            linear_x: 4.0,
+            linear_y: 0.0,
+            angular: 2.0,
+        };
+        let sound = |i: i64| Odometry {
+            stamp: Stamp(i * 20_000_000),
+            pose: Pose::exp([0.08 * i as f64, 0.0, 0.04 * i as f64]),
+            twist,
+        };
+        let mut completed = sound(0);
+        for i in 0..=100 {
+            let mut message = sound(i);
+            change(&mut message);
+            completed = fields.completed(&message);
+        }
+        (sound(100), completed, fields)
+    }
+
+    #[test]
+    fn what_is_whole_is_passed_on() {
+        let (sound, completed, fields) = circle(|_| ());
+        assert_eq!(sound, completed);
+        let mut findings = SensorFindings::default();
+        fields.report(&mut findings);
+        assert_eq!(findings.iter().count(), 0);
+    }
+
+    #[test]
+    fn a_twist_is_derived_from_the_pose() {
+        for factor in [0.0, -1.0, 3.6] {
+            let (sound, completed, fields) = circle(|message| {
+                message.twist.linear_x *= factor;
+                message.twist.angular *= factor;
+            });
+            assert!((completed.twist.linear_x - sound.twist.linear_x).abs() < 1e-6);
+            assert!((completed.twist.angular - sound.twist.angular).abs() < 1e-6);
+            let mut findings = SensorFindings::default();
+            fields.report(&mut findings);
+            let ratio = findings.get(SensorFinding::TwistFromPose).expect("found");
+            assert!((ratio - factor).abs() < 0.01, "{ratio}");
+        }
+    }
+
+    #[test]
+    fn a_pose_is_integrated_from_the_twist() {
+        for pose in [
+            Pose::IDENTITY,
+            Pose {
+                heading: f64::NAN,
+                ..Pose::IDENTITY
+            },
+        ] {
+            let (sound, completed, fields) = circle(|message| message.pose = pose);
+            // What the twist said before the pose was known to be missing is gone.
+            let off = completed.pose.distance(sound.pose);
+            assert!(off < 0.2, "{off}");
+            let mut findings = SensorFindings::default();
+            fields.report(&mut findings);
+            assert!(findings.get(SensorFinding::PoseFromTwist).is_some());
+        }
+    }
+
+    #[test]
+    fn a_coarse_pose_is_a_pose() {
+        let (_, _, fields) = circle(|message| {
+            message.pose.x = (message.pose.x / 0.2).round() * 0.2;
+            message.pose.y = (message.pose.y / 0.2).round() * 0.2;
+        });
+        assert!(!fields.no_pose);
+    }
+
+    #[test]
+    fn a_car_at_standstill_lacks_nothing() {
+        let mut fields = OdometryFields::default();
+        for i in 0..100 {
+            fields.completed(&Odometry {
+                stamp: Stamp(i * 20_000_000),
+                pose: Pose::IDENTITY,
+                twist: Twist::default(),
+            });
+        }
+        assert!(!fields.no_pose && fields.wrong_twist.is_none());
+    }
+}

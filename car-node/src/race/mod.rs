@@ -517,6 +517,19 @@ mod tests {
     }
 
     #[test]
+    fn the_reference_drives_club_on_grip_without_a_crash() {
+        // Real cars race on the reference. An emulation of it that cannot emulates something else.
+        let (track, map) = club();
+        let baseline = LocalizerParameters::named("synpf-baseline").expect("ships");
+        let results = race(&track, &map, &setup(PoseSource::Localizer(baseline), 3, 1)).expect("a race");
+        let [car] = &results[..] else { panic!("one car") };
+        assert!(car.finished && car.crashes == 0, "{car:?}");
+        // 7 to 8 cm over 10 laps with three seeds; lost, it would be metres.
+        let errors = car.pose_error.expect("errors");
+        assert!(errors.position_error_m.rmse < 0.15, "{errors:?}");
+    }
+
+    #[test]
     fn odometry_alone_does_not_last_ten_laps() {
         let (track, map) = club();
         let setup = RaceSetup {

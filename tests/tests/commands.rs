@@ -20,6 +20,62 @@ fn revision(verdict: &Verdict) -> u64 {
     }
 }
 
+/// Passes through every ordered pair of the built-in sets once.
+const CIRCUIT: [&str; 13] = [
+    "hq",
+    "lq",
+    "hq",
+    "adaptive",
+    "hq",
+    "synpf-baseline",
+    "lq",
+    "adaptive",
+    "lq",
+    "synpf-baseline",
+    "adaptive",
+    "synpf-baseline",
+    "hq",
+];
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_pair_of_sets_is_switched_from_the_pit_wall_and_the_updates_count_on() {
+    // Two of the pairs' kinds of localizer differ. `car-node/tests/switching.rs` holds the pose on the same circuit.
+    let endpoint = free_endpoint();
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let car = named("car-1");
+    let node = start_real(&car, 0.0, &endpoint, None);
+    let pose = || {
+        service
+            .fleet()
+            .car(&car)
+            .and_then(|car| car.pose)
+            .map(|(_, pose)| pose)
+    };
+    wait_until("the car drives", || pose().is_some_and(|pose| pose.update > 40)).await;
+    let mut last = 0;
+    for (from, to) in CIRCUIT.iter().zip(&CIRCUIT[1..]) {
+        let verdict = send_command(&service, &car, "ana", None, select(to)).await;
+        let Verdict::Answered { answer, .. } = &verdict else {
+            panic!("{from} to {to}: {verdict:?}");
+        };
+        let Outcome::Done {
+            update: Some(update), ..
+        } = answer.outcome
+        else {
+            panic!("{from} to {to}: {verdict:?}");
+        };
+        assert_eq!(answer.set.name, *to);
+        assert!(update > last, "{from} to {to}: update {update} after {last}");
+        wait_until("poses under the new set", || {
+            pose().is_some_and(|pose| pose.update > update + 10)
+        })
+        .await;
+        last = update;
+    }
+    node.shutdown("test over");
+    service.close().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_thousand_switches_lose_nothing_and_move_the_pose_no_more_than_a_scan_does() {
     const SWITCHES: u64 = 1000;

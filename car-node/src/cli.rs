@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use car_node::evaluate::Fault;
 use car_node::localization::Start;
 use car_node::network::endpoint;
-use car_node::ros2::pose_publisher;
+use car_node::ros2::topics;
 use car_node::sensors::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
@@ -81,7 +81,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 0, 232))]
     pub(crate) ros_domain: Option<u32>,
     /// With --source ros2: topic to publish the pose on for the car's own nodes (nav_msgs/Odometry in frame map).
-    #[arg(long, value_name = "TOPIC", default_value = pose_publisher::TOPIC)]
+    #[arg(long, value_name = "TOPIC", default_value = topics::POSE_ODOMETRY)]
     pub(crate) pose_topic: String,
     /// With --source ros2: topic of initial poses (geometry_msgs/PoseWithCovarianceStamped in frame map) [default: /initialpose
     /// in the namespace of the scan].

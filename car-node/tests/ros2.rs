@@ -14,7 +14,7 @@ use car_node::ros2::messages::{
     self, Header, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, RosPose, TfMessage,
     TransformStamped, Vector3,
 };
-use car_node::ros2::pose_publisher;
+use car_node::ros2::{pose_publisher, topics};
 use car_node::sensors::bag::{SensorEvent, Topics};
 use car_node::sensors::clock::wall_now;
 use car_node::sensors::{Feed, Next, PoseEstimate, Race, Ros2, Ros2Error, Ros2Options, Source};
@@ -182,7 +182,7 @@ fn options(endpoint: &str) -> Ros2Options {
         domain: 0,
         topics: Topics::default(),
         initial_pose_topic: None,
-        outputs: vec![pose_publisher::TOPIC.into()],
+        outputs: vec![topics::POSE_ODOMETRY.into()],
         mount: None,
     }
 }
@@ -220,7 +220,7 @@ fn localizes(naming: Naming) {
     if let Some(connection) = source.ros_connection() {
         let key = "0/pf/pose/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0123";
         poses = Some(ros_router.declare_subscriber(key).wait().expect("subscribes"));
-        let started = pose_publisher::start(connection.clone(), pose_publisher::TOPIC);
+        let started = pose_publisher::start(connection.clone(), topics::POSE_ODOMETRY);
         pose_sink = Some(started.expect("starts").0);
     }
     assert_eq!(pose_sink.is_some(), naming == Naming::RmwZenoh);

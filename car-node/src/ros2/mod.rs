@@ -2,3 +2,4 @@
 
 pub mod messages;
 pub mod pose_publisher;
+pub mod topics;

@@ -17,9 +17,6 @@ use crate::ros2::messages::{self, Header, RosOdometry, RosPose, Vector3};
 use crate::sensors::PoseEstimate;
 use crate::sensors::clock::wall_now;
 
-/// The topic on which the reference publishes its pose, and which controllers subscribe to.
-pub const TOPIC: &str = "/pf/pose/odom";
-
 /// The name of our node in the ROS graph.
 const NODE: &str = "synpf";
 /// The type, as keys spell it.

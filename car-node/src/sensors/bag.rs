@@ -10,7 +10,7 @@ use mcap::McapError;
 use synpf::{Odometry, Scan, Stamp, YawRate};
 
 use crate::ros2::messages::{self, CdrError, Imu, LaserScan, PoseStamped, RosOdometry, TfMessage};
-use crate::ros2::pose_publisher;
+use crate::ros2::topics;
 use crate::sensors::frames::{Frames, Mount};
 use crate::sensors::mcap_reader::McapReader;
 
@@ -77,7 +77,7 @@ pub(crate) const ODOMETRY_NAMES: [&str; 4] = [
 ];
 pub(crate) const TRUTH_NAMES: [&str; 1] = ["/ground_truth/odom"];
 /// Where localizers publish their poses as `nav_msgs/Odometry`, ours among them.
-const LOCALIZER_OUTPUTS: [&str; 1] = [pose_publisher::TOPIC];
+const LOCALIZER_OUTPUTS: [&str; 1] = [topics::POSE_ODOMETRY];
 pub(crate) const IMU_NAMES: [&str; 2] = ["/sensors/imu/raw", "/imu"];
 
 /// False for a topic of type `nav_msgs/Odometry` that is known to be no wheel odometry: ground truth, and the output of a

@@ -77,6 +77,8 @@ mod reference;
 mod regions;
 mod resampling;
 mod scan_matcher;
+mod score_pyramid;
+mod search_parameters;
 mod sensor_check;
 mod sensor_model;
 mod sensor_parameters;
@@ -89,7 +91,7 @@ mod validation;
 
 pub use beam_layout::{BeamLayout, BeamParameters};
 pub use error::SetUpError;
-pub use global_search::{GlobalCheck, GlobalCheckOutcome, SearchParameters};
+pub use global_search::{GlobalCheck, GlobalCheckOutcome};
 pub use localizer::{
     Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
     ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, SensorFinding, SensorFindings,
@@ -103,6 +105,7 @@ pub use reference::{
     Reference, ReferenceDefects, ReferenceMotionModel, ReferenceParameters, ReferenceTuning,
 };
 pub use scan_matcher::RefinementParameters;
+pub use search_parameters::SearchParameters;
 pub use sensor_parameters::{RangeMethod, SensorModelKind, SensorParameters};
 pub use synpf::SynPf;
 #[doc(hidden)]

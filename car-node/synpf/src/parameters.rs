@@ -12,11 +12,11 @@ use serde_json::Value;
 use localizer::{ParameterFault, ParameterValues};
 
 use crate::beam_layout::BeamParameters;
-use crate::global_search::SearchParameters;
 use crate::motion_model::MotionParameters;
 use crate::particles::ParticleParameters;
 use crate::recovery::RecoveryParameters;
 use crate::scan_matcher::RefinementParameters;
+use crate::search_parameters::SearchParameters;
 use crate::sensor_parameters::SensorParameters;
 use crate::validation::Check;
 

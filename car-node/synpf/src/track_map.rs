@@ -5,11 +5,11 @@ use std::sync::{Arc, OnceLock};
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
-use crate::correlative_match::ScorePyramid;
 use crate::error::SetUpError;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::reference::RangeTables;
 use crate::regions::{NOWHERE, Region, regions};
+use crate::score_pyramid::ScorePyramid;
 use crate::table_store::{Table, TableJob, TableKey, TablePolicy, TableStore};
 
 /// A map with what the filter looks up in it: distance field, separate regions of free space, and range tables,

@@ -6,11 +6,14 @@ use common::{BASE_LINK_FROM_LASER, lap, odometry, ring, scan, stamp, truth};
 use maps::Pose;
 use synpf::{Dropped, Odometry, Parameters, Scan, SensorFinding, SynPf, Twist, Update, YawRate};
 
+/// What happens to a message at a time [s].
+type Change<T> = Box<dyn Fn(f64, &mut T)>;
+
 /// The changes that a test makes to what the sensors say; times are seconds of the drive.
 struct Sensors {
-    odometry: Box<dyn Fn(f64, &mut Odometry)>,
+    odometry: Change<Odometry>,
     gyro: Option<Box<dyn Fn(f64) -> f64>>,
-    scan: Box<dyn Fn(f64, &mut Scan)>,
+    scan: Change<Scan>,
 }
 
 impl Default for Sensors {

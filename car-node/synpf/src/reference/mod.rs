@@ -30,6 +30,6 @@ mod range_table;
 mod sensor_table;
 
 pub use filter::{Reference, ReferenceTuning};
-pub use motion::ReferenceMotionModel;
+pub use parameters::ReferenceMotionModel;
 pub use parameters::{ReferenceDefects, ReferenceParameters};
 pub(crate) use range_table::RangeTables;

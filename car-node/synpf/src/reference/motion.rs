@@ -3,24 +3,8 @@
 use maps::{Pose, wrap_angle};
 use rand::rngs::SmallRng;
 use rand_distr::{Distribution, StandardNormal};
-use serde::{Deserialize, Serialize};
 
-use super::parameters::ReferenceParameters;
-
-/// Which motion model moves the particles.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ReferenceMotionModel {
-    /// Rotate, drive, rotate, with a rotation noise that shrinks with speed (Stahl et al., IV 2019).
-    Tum,
-    /// Rotate, drive, rotate; the noise is a sum of standard deviations, unlike in AMCL.
-    Amcl,
-    /// Drive along an arc, then slip sideways.
-    Arc,
-    /// The motion in the car's frame, with constant noise along the map's axes (MIT's particle filter).
-    #[serde(alias = "mit")]
-    Default,
-}
+use super::parameters::{ReferenceMotionModel, ReferenceParameters};
 
 /// One tick of odometry.
 #[derive(Debug, Clone, Copy, PartialEq)]

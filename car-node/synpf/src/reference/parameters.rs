@@ -4,8 +4,22 @@ use localizer::{ParameterFault, ParameterValues, overlay, to_values};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::motion::ReferenceMotionModel;
 use crate::validation::Check;
+
+/// Which motion model moves the particles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReferenceMotionModel {
+    /// Rotate, drive, rotate, with a rotation noise that shrinks with speed (Stahl et al., IV 2019).
+    Tum,
+    /// Rotate, drive, rotate; the noise is a sum of standard deviations, unlike in AMCL.
+    Amcl,
+    /// Drive along an arc, then slip sideways.
+    Arc,
+    /// The motion in the car's frame, with constant noise along the map's axes (MIT's particle filter).
+    #[serde(alias = "mit")]
+    Default,
+}
 
 /// The reference's parameters; the default is what it ships.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -76,7 +76,7 @@ impl OdometryFields {
         ];
         self.twist_seen |= linear_x != 0.0 || linear_y != 0.0 || angular != 0.0;
         let by_twist = mean[0].hypot(mean[1]) * dt.min(GAP);
-        let same = |a: f64, b: f64| a.to_bits() == b.to_bits() || a == b;
+        let same = |a: f64, b: f64| (a - b).abs() <= 0.0;
         let stood = same(message.pose.x, last.pose.x)
             && same(message.pose.y, last.pose.y)
             && same(message.pose.heading, last.pose.heading);

@@ -65,6 +65,10 @@ impl RefinementParameters {
     }
 }
 
+/// How much of what end points err together the fit itself goes by; the covariance goes by all of it. A fit that goes by all
+/// follows odometry for seconds, which errs by more than most maps do.
+const SHARE_OF_SHARED: f64 = 0.1;
+
 /// The sums of one Gauss-Newton step.
 struct Normal {
     information: Matrix3<f64>,
@@ -76,8 +80,8 @@ struct Normal {
 pub(crate) struct ScanMatch {
     /// The pose, with the covariance of a filter that trusts end points by `refine_sigma`: what the next fit goes by.
     pub(crate) estimate: Estimate,
-    /// Covariance of the pose with end points that scatter as they were seen to. `refine_sigma` leaves room for what a map
-    /// has wrong, which most of it has not: the fit then errs by less than the filter allows for.
+    /// Covariance of the pose with end points that scatter, and err together, as they were seen to. `refine_sigma` leaves room
+    /// for what a map has wrong, which most of it has not; and errors that all scans of a stretch share do not average out.
     pub(crate) covariance: Matrix3<f64>,
 }
 
@@ -90,21 +94,25 @@ pub(crate) fn refine(
     walls: WallCalibration,
     parameters: &RefinementParameters,
 ) -> Estimate {
-    match_scan(field, points, start, prior, walls, parameters).estimate
+    match_scan(field, points, start, prior, &prior.covariance, walls, parameters).estimate
 }
 
-/// Fits the end points to the field around `prior`, starting from `start`.
+/// Fits the end points to the field around `prior`, starting from `start`. `seen` is the prior's covariance as
+/// [`ScanMatch::covariance`] has it.
 pub(crate) fn match_scan(
     field: &DistanceField,
     points: &[[f32; 2]],
     start: Pose,
     prior: &Estimate,
+    seen: &Matrix3<f64>,
     walls: WallCalibration,
     parameters: &RefinementParameters,
 ) -> ScanMatch {
     let stride = points.len().div_ceil(parameters.refine_beams).max(1);
     let sigma = parameters.refine_sigma.max(walls.scatter);
-    let weight = 1.0 / (sigma.powi(2) * (parameters.refine_correlation / stride as f64).max(1.0));
+    let together = walls.correlation();
+    let correlation = parameters.refine_correlation.max(SHARE_OF_SHARED * together);
+    let weight = 1.0 / (sigma.powi(2) * (correlation / stride as f64).max(1.0));
     let least_reach = parameters.refine_reach * sigma / parameters.refine_sigma;
     let prior_information = regular_inverse(&prior.covariance);
     // A start that may be far off looks farther at first.
@@ -137,16 +145,16 @@ pub(crate) fn match_scan(
         reach = (reach * 0.5).max(least_reach);
     }
     let covariance = regular_inverse(&information);
-    // The covariance of an update whose gain supposes more noise than there is (Joseph's form, in information).
+    // The covariance of an update whose gain supposes other noise than there is (Joseph's form, in information).
     let share = if walls.scatter > 0.0 {
-        (walls.scatter / sigma).powi(2)
+        (walls.scatter / sigma).powi(2) * (together / correlation).max(1.0)
     } else {
         1.0
     };
-    let seen = prior_information + (information - prior_information) * share;
+    let noise = prior_information * seen * prior_information + (information - prior_information) * share;
     ScanMatch {
         estimate: Estimate { pose, covariance },
-        covariance: covariance * seen * covariance,
+        covariance: covariance * noise * covariance,
     }
 }
 
@@ -337,6 +345,24 @@ mod tests {
         );
         assert!((found.covariance[(0, 0)].sqrt() - 0.2).abs() < 0.02);
         assert!(found.covariance[(1, 1)].sqrt() < 0.02);
+    }
+
+    #[test]
+    fn errors_that_end_points_share_widen_the_covariance_more_than_they_loosen_the_fit() {
+        let field = room(false);
+        let pose = Pose::new(4.0, 2.0, 0.4);
+        let points = scan(&field, pose);
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 0.01));
+        let prior = Estimate { pose, covariance };
+        let parameters = RefinementParameters::default();
+        let matched = |walls| match_scan(&field, &points, pose, &prior, &covariance, walls, &parameters);
+        let sound = matched(WallCalibration::with_correlation(1.0));
+        let shared = matched(WallCalibration::with_correlation(100.0));
+        let ratio = |of: fn(&ScanMatch) -> f64| of(&shared) / of(&sound);
+        let gain = ratio(|found| found.estimate.covariance[(0, 0)]);
+        let known = ratio(|found| found.covariance[(0, 0)]);
+        assert!(gain > 2.0 && gain < 4.0, "{gain}");
+        assert!(known > 15.0 && known < 40.0, "{known}");
     }
 
     #[test]

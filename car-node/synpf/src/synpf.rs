@@ -223,10 +223,12 @@ impl SynPf {
         } = self;
         let (field, points) = (self.map.field(), &self.scan.points);
         let before = self.tracker.estimate;
+        let seen = self.tracker.predicted_covariance(predicted);
         let fit = fit_scan(
             field,
             points,
             predicted,
+            &seen,
             weighted,
             calibration.walls,
             &parameters.refinement,
@@ -234,8 +236,8 @@ impl SynPf {
         let estimate = fit.estimate;
         self.tracker.estimate = estimate;
         let turn = rotation(estimate.pose.heading);
-        self.tracker.covariance =
-            fit.covariance + turn * calibration.sweep_error(step.sweep) * turn.transpose();
+        self.tracker.covariance = fit.covariance;
+        self.tracker.sweep_error = turn * calibration.sweep_error(step.sweep) * turn.transpose();
 
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
@@ -339,7 +341,11 @@ impl SynPf {
                 pose: particles.mean,
                 covariance: particles.covariance,
             };
-            spread = cloud.along_and_across();
+            let (of_cloud, own) = (
+                cloud.along_and_across(),
+                self.tracker.posterior().along_and_across(),
+            );
+            spread = [of_cloud[0].max(own[0]), of_cloud[1].max(own[1])];
             ess_ratio = particles.ess_ratio;
             if self.mode == Mode::Tracking {
                 innovation = self.tracker.estimate.pose.since(predicted.pose);

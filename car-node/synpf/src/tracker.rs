@@ -21,6 +21,8 @@ pub(crate) struct Tracker {
     pub(crate) estimate: Estimate,
     /// Covariance of its pose as far as is known; see [`ScanMatch::covariance`].
     pub(crate) covariance: Matrix3<f64>,
+    /// What the latest scan's beams, brought to one time, add to it; of no weight for the next scan.
+    pub(crate) sweep_error: Matrix3<f64>,
     /// When it is true, and odometry's pose then; None until it is known.
     pub(crate) at: Option<(Stamp, Pose)>,
 }
@@ -47,6 +49,9 @@ pub(crate) struct Uncertainty {
 /// The interval that the shares in `odometry_*_error` refer to [s]: that of a laser at 40 Hz.
 const NOISE_INTERVAL: f64 = 0.025;
 
+/// For so long odometry errs by the same share [s]: a bend, a braking. Beyond, errors are as good as independent.
+const LASTING: f64 = 0.5;
+
 /// Shorter intervals between scans count as this [s].
 const SHORTEST: f64 = 1e-3;
 
@@ -66,6 +71,7 @@ impl Tracker {
         Self {
             estimate,
             covariance: estimate.covariance,
+            sweep_error: Matrix3::zeros(),
             at: None,
         }
     }
@@ -74,13 +80,14 @@ impl Tracker {
     pub(crate) fn set(&mut self, estimate: Estimate) {
         self.estimate = estimate;
         self.covariance = estimate.covariance;
+        self.sweep_error = Matrix3::zeros();
     }
 
     /// The pose with what is known of its uncertainty.
     pub(crate) fn posterior(&self) -> Estimate {
         Estimate {
             pose: self.estimate.pose,
-            covariance: self.covariance,
+            covariance: self.covariance + self.sweep_error,
         }
     }
 
@@ -102,6 +109,20 @@ impl Tracker {
     ) -> Estimate {
         self.estimate
             .moved(motion, &process_noise(motion, seconds, uncertainty, parameters))
+    }
+
+    /// The covariance as far as is known, carried on as `predicted` was; it grows by as much.
+    pub(crate) fn predicted_covariance(&self, predicted: &Estimate) -> Matrix3<f64> {
+        let motion = predicted.pose.since(self.estimate.pose);
+        let carried = |covariance: Matrix3<f64>| {
+            let from = Estimate {
+                covariance,
+                ..self.estimate
+            };
+            from.moved(motion, &Matrix3::zeros()).covariance
+        };
+        let grown = predicted.covariance - carried(self.estimate.covariance);
+        carried(self.covariance) + grown
     }
 }
 
@@ -133,6 +154,7 @@ pub(crate) fn fit_scan(
     field: &DistanceField,
     points: &[[f32; 2]],
     predicted: &Estimate,
+    seen: &Matrix3<f64>,
     weighted: &Weighted,
     walls: WallCalibration,
     parameters: &RefinementParameters,
@@ -154,21 +176,28 @@ pub(crate) fn fit_scan(
         return fit(unchanged(particles), false);
     }
     let on_walls = |estimate: &Estimate| share_on_walls(field, points, 60, estimate.pose, FIT_REACH);
-    let matched = |prior: &Estimate| match_scan(field, points, prior.pose, prior, walls, parameters);
-    let from_predicted = matched(predicted);
+    let matched =
+        |prior: &Estimate, seen| match_scan(field, points, prior.pose, prior, seen, walls, parameters);
+    let from_predicted = matched(predicted, seen);
     let (before, after) = (on_walls(predicted), on_walls(&from_predicted.estimate));
     if on_walls(&particles) > before.max(after) + FIT_MARGIN {
-        let from_particles = matched(&Estimate {
-            covariance: particles.covariance + Matrix3::identity() * 1e-4,
+        let covariance = particles.covariance + Matrix3::identity() * 1e-4;
+        let around = Estimate {
+            covariance,
             ..particles
-        });
+        };
+        let from_particles = matched(&around, &covariance);
         if on_walls(&from_particles.estimate) > after + FIT_MARGIN {
             return fit(from_particles, false);
         }
     }
     // A fit that made things worse has run away.
     if after + FIT_MARGIN < before {
-        fit(unchanged(*predicted), true)
+        let kept = ScanMatch {
+            estimate: *predicted,
+            covariance: *seen,
+        };
+        fit(kept, true)
     } else {
         fit(from_predicted, true)
     }
@@ -176,8 +205,8 @@ pub(crate) fn fit_scan(
 
 /// Covariance of odometry's error over a motion, in the frame of its start.
 ///
-/// The error of odometry's velocity is taken for white noise: errors of two intervals of [`NOISE_INTERVAL`] have nothing in
-/// common, and their variances add up. So a drive ends equally uncertain however many scans it is cut into.
+/// Odometry errs by the same share for [`LASTING`]: a scan each 0.1 s leaves it four times the way to err on that one each
+/// 0.025 s does. A faster laser sees no more of it: below [`NOISE_INTERVAL`] variances add up, as those of white noise do.
 fn process_noise(
     motion: Pose,
     seconds: f64,
@@ -193,8 +222,9 @@ fn process_noise(
     };
     let across = p.odometry_side_error * distance;
     let turn = p.odometry_yaw_error * motion.heading;
-    // n intervals, each with its share of the motion: n (error / n)^2.
-    let intervals = seconds.max(SHORTEST) / NOISE_INTERVAL;
+    // n intervals that err independently, each with its share of the motion: n (error / n)^2.
+    let seconds = seconds.max(SHORTEST);
+    let intervals = (seconds / NOISE_INTERVAL).min((seconds / LASTING).max(1.0));
     let grown = |error: f64| (error * factor).powi(2) / intervals;
     let steady_xy = p.diffusion_xy.powi(2) * seconds;
     let steady_heading = p.diffusion_heading.powi(2) * seconds;
@@ -218,6 +248,7 @@ mod tests {
                 covariance: Matrix3::zeros(),
             },
             covariance: Matrix3::zeros(),
+            sweep_error: Matrix3::zeros(),
             at: None,
         };
         for step in 0..steps {
@@ -228,26 +259,42 @@ mod tests {
         tracker.estimate.covariance
     }
 
-    /// Sigma per scan gave twice the sigma at 10 Hz that it gave at 40 Hz. What is left is the coarser path.
+    const GRIPPING: Uncertainty = Uncertainty {
+        factor: 1.0,
+        sliding: None,
+    };
+
     #[test]
-    fn a_drive_ends_equally_uncertain_at_any_scan_rate() {
-        let gripping = Uncertainty {
-            factor: 1.0,
-            sliding: None,
-        };
+    fn a_drive_ends_equally_uncertain_with_a_faster_laser() {
         let sliding = Uncertainty {
             factor: 2.0,
             sliding: Some(5.0),
         };
-        for uncertainty in [gripping, sliding] {
+        for uncertainty in [GRIPPING, sliding] {
             let usual = after_drive(80, uncertainty);
-            for hertz in [10, 20, 100] {
-                let other = after_drive(2 * hertz, uncertainty);
-                for i in 0..3 {
-                    let ratio = (other[(i, i)] / usual[(i, i)]).sqrt();
-                    assert!((ratio - 1.0).abs() < 0.04, "{hertz} Hz, {i}: {ratio}");
-                }
+            let other = after_drive(200, uncertainty);
+            for i in 0..3 {
+                let ratio = (other[(i, i)] / usual[(i, i)]).sqrt();
+                assert!((ratio - 1.0).abs() < 0.04, "{i}: {ratio}");
             }
         }
+    }
+
+    /// As white noise, a scan each 0.1 s left half the sigma of the share that odometry errs by, and NEES at 24 for 2.
+    #[test]
+    fn a_slow_laser_leaves_odometry_the_share_that_it_errs_by() {
+        let parameters = MotionParameters {
+            diffusion_xy: 0.0,
+            ..MotionParameters::default()
+        };
+        let share = |seconds: f64| {
+            let way = 5.0 * seconds;
+            process_noise(Pose::new(way, 0.0, 0.0), seconds, GRIPPING, &parameters)[(0, 0)].sqrt() / way
+        };
+        for seconds in [0.025, 0.1, 0.25, 0.5] {
+            assert!((share(seconds) / parameters.odometry_speed_error - 1.0).abs() < 1e-9);
+        }
+        // Over longer ways errors cancel in part.
+        assert!((share(2.0) / share(0.5) - 0.5).abs() < 1e-9);
     }
 }

@@ -14,6 +14,22 @@ pub(crate) struct WallCalibration {
     pub(crate) offset: f64,
     /// Standard deviation of the end points about them [m]; 0 before anything was seen.
     pub(crate) scatter: f64,
+    /// How far the end points of one stretch of wall err together, and how long a stretch stays in view.
+    shared: Shared,
+}
+
+/// What end points on the same stretch of wall have in common. Laser noise differs from beam to beam and the grain of a map
+/// from cell to cell; a board in front of the wall or a bend of the map pulls a whole stretch the same way.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Shared {
+    /// Sum of the products of the pulls of two end points on one stretch, over all pairs [m^2].
+    common: f64,
+    /// Sum of their squares [m^2].
+    own: f64,
+    /// How far the laser sees on average [m].
+    view: f64,
+    /// Way between two scans [m].
+    step: f64,
 }
 
 /// End points farther from all walls are no hits of theirs [m].
@@ -25,7 +41,49 @@ const FEWEST: usize = 20;
 /// End points that are looked at.
 const MOST: usize = 180;
 
+/// Length of a stretch of wall whose end points are taken to err together [m]: a board, a person, a bend of the map.
+const STRETCH: f32 = 1.0;
+
+/// End points farther apart than this are on different walls [m].
+const GAP: f32 = 0.3;
+
+/// A stretch counts as seen by so many scans at most.
+const MOST_SCANS: f64 = 200.0;
+
+impl Shared {
+    /// By how much the variance of a sum over the end points of all scans that see a stretch exceeds what it were if they erred
+    /// independently (the design effect of Kish, Survey Sampling, 1965): 1 + (number that err together - 1) times their
+    /// correlation.
+    fn design_effect(&self) -> f64 {
+        if self.own <= 0.0 {
+            return 1.0;
+        }
+        let scans = (self.view / self.step.max(1e-3)).clamp(1.0, MOST_SCANS);
+        1.0 + scans * (self.common / self.own).max(0.0)
+    }
+}
+
 impl WallCalibration {
+    /// How many end points count as one, by what those of one stretch have in common.
+    pub(crate) fn correlation(&self) -> f64 {
+        self.shared.design_effect()
+    }
+
+    /// Walls of a sound map that a laser of 2 cm sees, but for what their end points have in common.
+    #[cfg(test)]
+    pub(crate) fn with_correlation(correlation: f64) -> Self {
+        Self {
+            offset: 0.0,
+            scatter: 0.02,
+            shared: Shared {
+                common: correlation - 1.0,
+                own: 1.0,
+                view: 1.0,
+                step: 1.0,
+            },
+        }
+    }
+
     /// The walls by one scan at a pose; None where hardly a point lies at a wall. The offset is the robust mean of the signed
     /// distances, the scatter their median absolute deviation (Huber, Robust Statistics, 1981, section 5.1) about what is
     /// `known`, as a standard deviation.
@@ -36,6 +94,9 @@ impl WallCalibration {
         let cells = 1.0 / field.resolution() as f32;
         let (sin, cos) = (pose.heading.sin() as f32, pose.heading.cos() as f32);
         let (mut sum, mut total) = (0.0f32, 0.0f32);
+        // The stretch at hand: where it began, its last point, the sum of its pulls.
+        let (mut began, mut last, mut pull) = ([f32::MAX; 2], [f32::MAX; 2], 0.0f32);
+        let (mut together, mut own, mut view) = (0.0f32, 0.0f32, 0.0f32);
         let mut deviations = [0.0f32; MOST];
         let mut count = 0;
         for point in points.iter().step_by(stride) {
@@ -49,6 +110,15 @@ impl WallCalibration {
             let weight = 1.0 / (1.0 + ratio * ratio).powi(2);
             sum += weight * sample.distance;
             total += weight;
+            let distance = |from: [f32; 2]| (point[0] - from[0]).hypot(point[1] - from[1]);
+            if distance(began) > STRETCH || distance(last) > GAP * (stride as f32).max(1.0) {
+                together += pull * pull;
+                (began, pull) = (*point, 0.0);
+            }
+            last = *point;
+            pull += weight * deviation;
+            own += (weight * deviation).powi(2);
+            view += weight * point[0].hypot(point[1]);
             if deviation.abs() < REACH {
                 deviations[count] = deviation.abs();
                 count += 1;
@@ -57,10 +127,18 @@ impl WallCalibration {
         if count < FEWEST || total < FEWEST as f32 {
             return None;
         }
+        together += pull * pull;
         let (_, median, _) = deviations[..count].select_nth_unstable_by(count / 2, f32::total_cmp);
         Some(Self {
             offset: f64::from(sum / total),
             scatter: f64::from(*median * SIGMA_OF_MEDIAN),
+            // Of the points between those looked at, each has the same in common with its stretch.
+            shared: Shared {
+                common: f64::from(together - own) * stride as f64,
+                own: f64::from(own),
+                view: f64::from(view / total),
+                step: 0.0,
+            },
         })
     }
 
@@ -73,6 +151,13 @@ impl WallCalibration {
         let gain = 1.0 - (-driven.abs() / distance).exp();
         self.offset = (self.offset + gain * (seen.offset - self.offset)).clamp(-MOST_OFFSET, MOST_OFFSET);
         self.scatter = (self.scatter + gain * (seen.scatter - self.scatter)).min(MOST_SCATTER);
+        let learned = |old: f64, new: f64| old + gain * (new - old);
+        self.shared = Shared {
+            common: learned(self.shared.common, seen.shared.common),
+            own: learned(self.shared.own, seen.shared.own),
+            view: learned(self.shared.view, seen.shared.view),
+            step: learned(self.shared.step, driven.abs()),
+        };
     }
 }
 
@@ -121,6 +206,26 @@ mod tests {
         let mut standing = WallCalibration::default();
         standing.learn(walls, 0.0, 3.0);
         assert_eq!(standing, WallCalibration::default());
+    }
+
+    #[test]
+    fn a_board_in_front_of_the_wall_is_an_error_that_end_points_share() {
+        let (field, pose) = (wall(), Pose::new(10.0, 1.0, 0.0));
+        let correlation = |points: &[[f32; 2]]| {
+            let mut walls = WallCalibration::default();
+            for _ in 0..200 {
+                let seen = WallCalibration::seen(&field, points, pose, walls).expect("a wall in view");
+                walls.learn(seen, 0.1, 3.0);
+            }
+            walls.correlation()
+        };
+        let plain = hits(0.0, 0.02);
+        let mut boarded = plain.clone();
+        for point in &mut boarded[240..300] {
+            point[1] -= 0.08;
+        }
+        let (plain, boarded) = (correlation(&plain), correlation(&boarded));
+        assert!(boarded > 50.0 && boarded > 5.0 * plain, "{plain} {boarded}");
     }
 
     #[test]

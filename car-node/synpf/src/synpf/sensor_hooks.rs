@@ -117,7 +117,15 @@ impl SynPf {
             ..*predicted
         };
         let share = |points: &[[f32; 2]]| {
-            let matched = match_scan(field, points, prior.pose, &prior, calibration.walls, refinement);
+            let matched = match_scan(
+                field,
+                points,
+                prior.pose,
+                &prior,
+                &prior.covariance,
+                calibration.walls,
+                refinement,
+            );
             let reach = refinement.refine_reach as f32;
             fit(field, points, COMPARED, matched.estimate.pose, reach)
         };

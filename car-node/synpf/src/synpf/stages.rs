@@ -83,6 +83,7 @@ impl SynPf {
                     self.map.field(),
                     &self.scan.points,
                     estimate,
+                    &self.tracker.covariance,
                     &weighted,
                     self.calibration.walls,
                     &parameters.refinement,

@@ -21,7 +21,7 @@ fn club() -> Track {
     Track::load(tracks.join("club"), None).expect("bundled")
 }
 
-/// The log of one car of a race, driven on the filter's estimates for `moving` of `seconds` [s]. A driver that never gets
+/// The log of one car of a race, driven on the filter's estimates for `moving` of `seconds` \[s\]. A driver that never gets
 /// one stays where it is.
 fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorLog {
     let map = Arc::new(TrackMap::new(track.grid.clone()).expect("free cells"));

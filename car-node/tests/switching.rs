@@ -42,7 +42,7 @@ const CIRCUIT: [&str; 13] = [
     "hq",
 ];
 
-/// The car drives this long before the first switch, and then under each set [s].
+/// The car drives this long before the first switch, and then under each set \[s\].
 const BEFORE: f64 = 4.0;
 const UNDER_EACH: f64 = 1.5;
 
@@ -224,7 +224,7 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
     }
 }
 
-/// The distance that the car has driven [m].
+/// The distance that the car has driven \[m\].
 fn truth_length(truth: &Truth, estimates: &[(usize, PoseEstimate)]) -> f64 {
     let poses: Vec<Pose> = estimates
         .iter()

@@ -5,7 +5,7 @@
 pub struct ScanFit {
     /// Share of the valid beams that end within 0.10 m of a wall, in [0, 1].
     pub alignment: f64,
-    /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
+    /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
     pub residual: f64,
     /// Share of the valid beams more than 0.3 m shorter than the map says, in [0, 1].
     pub short_beams: f64,

@@ -21,7 +21,7 @@ pub enum SensorFinding {
     OdometryTurnWrong,
     /// Odometry's twist is missing, or does not fit its pose; it is derived from the pose. Twist over pose.
     TwistFromPose,
-    /// Odometry's pose does not move, or has no orientation; it is integrated from the twist. Distance by the twist [m].
+    /// Odometry's pose does not move, or has no orientation; it is integrated from the twist. Distance by the twist \[m\].
     PoseFromTwist,
     /// Odometry's distance is a fixed multiple of the distance by the scans; it is corrected. That multiple.
     WheelScale,
@@ -29,15 +29,15 @@ pub enum SensorFinding {
     Creep,
     /// The wheels gain or lose speed as no tyre can; the car's own speed is carried on. Wheels less car [m/s].
     WheelsSlide,
-    /// The scanner states no `time_increment`; it is taken from `scan_time`. Length of the sweep [s].
+    /// The scanner states no `time_increment`; it is taken from `scan_time`. Length of the sweep \[s\].
     SweepFromScanTime,
-    /// `time_increment` is as long as a scan; it is corrected. What was stated [s].
+    /// `time_increment` is as long as a scan; it is corrected. What was stated \[s\].
     TimeIncrementWrong,
-    /// `range_max` is no range; the parameter set's largest range is used. What was stated [m].
+    /// `range_max` is no range; the parameter set's largest range is used. What was stated \[m\].
     RangeMaxWrong,
-    /// `angle_increment` is zero; it is taken from `angle_min` and `angle_max`. What is used [rad].
+    /// `angle_increment` is zero; it is taken from `angle_min` and `angle_max`. What is used \[rad\].
     AngleIncrementMissing,
-    /// The scans' stamps are late against odometry's; it is corrected. By how much [s].
+    /// The scans' stamps are late against odometry's; it is corrected. By how much \[s\].
     ScanLag,
 }
 

@@ -10,21 +10,21 @@ use crate::Stamp;
 pub struct Scan {
     /// When the first beam was measured.
     pub stamp: Stamp,
-    /// Direction of the first beam in the laser's frame [rad].
+    /// Direction of the first beam in the laser's frame \[rad\].
     pub angle_min: f64,
-    /// Angle from one beam to the next, signed [rad].
+    /// Angle from one beam to the next, signed \[rad\].
     pub angle_increment: f64,
-    /// Time from one beam to the next; 0 when the whole scan has one time [s].
+    /// Time from one beam to the next; 0 when the whole scan has one time \[s\].
     pub time_increment: f64,
-    /// Time from one scan to the next, as the scanner states it [s]; None or 0 when it does not.
+    /// Time from one scan to the next, as the scanner states it \[s\]; None or 0 when it does not.
     pub scan_time: Option<f64>,
-    /// Direction of the last beam, as the scanner states it [rad]; None when it does not.
+    /// Direction of the last beam, as the scanner states it \[rad\]; None when it does not.
     pub angle_max: Option<f64>,
-    /// Readings below this are no measurement [m].
+    /// Readings below this are no measurement \[m\].
     pub range_min: f64,
-    /// Readings from here on mean "nothing in range" [m].
+    /// Readings from here on mean "nothing in range" \[m\].
     pub range_max: f64,
-    /// One reading per beam [m]; NaN and infinities are allowed and mean "no return".
+    /// One reading per beam \[m\]; NaN and infinities are allowed and mean "no return".
     pub ranges: Vec<f32>,
 }
 

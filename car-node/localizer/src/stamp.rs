@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 pub struct Stamp(pub i64);
 
 impl Stamp {
-    /// Seconds from `earlier` to this stamp; negative when it is the later one [s].
+    /// Seconds from `earlier` to this stamp; negative when it is the later one \[s\].
     pub fn since(self, earlier: Self) -> f64 {
         self.0.saturating_sub(earlier.0) as f64 * 1e-9
     }

@@ -75,14 +75,14 @@ pub struct Update {
     pub particles: usize,
     /// Effective sample size over the number of particles, after weighing and before resampling, in (0, 1].
     pub ess_ratio: f64,
-    /// Standard deviation of the particles along and across the car's heading [m].
+    /// Standard deviation of the particles along and across the car's heading \[m\].
     pub spread: [f64; 2],
     /// Mass of the second cluster of particles over that of the first, in [0, 1] (clusters of 0.5 m and 20 deg).
     pub second_mode: f64,
     /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall, in [0, 1]. A beam is valid that
     /// has a return, and does not leave the mapped part of the world, as through a door that was shut when it was mapped.
     pub alignment: f64,
-    /// Mean over the same beams of min(distance to the nearest wall, 1 m) [m].
+    /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
     pub residual: f64,
     /// Share of the valid beams more than 0.3 m shorter than the map says: something stands in view.
     pub short_beams: f64,
@@ -95,9 +95,9 @@ pub struct Update {
     /// The two averages are those of augmented MCL (Probabilistic Robotics, table 8.3), but taken over the alignment of the
     /// beams that end at no obstacle, where the table takes the mean likelihood of the particles.
     pub w_ratio: f64,
-    /// The correction that this scan made to the predicted pose: distance [m] and angle [rad].
+    /// The correction that this scan made to the predicted pose: distance \[m\] and angle \[rad\].
     pub innovation: [f64; 2],
-    /// By how far odometry has jumped since the update before [m], [rad]; None when it has not.
+    /// By how far odometry has jumped since the update before \[m\], \[rad\]; None when it has not.
     pub odometry_jump: Option<[f64; 2]>,
     /// Slip: (odometry's distance - the posterior's) / odometry's, over the last 0.3 s; positive when the wheels
     /// spin; 0 below walking speed.

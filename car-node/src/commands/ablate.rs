@@ -24,12 +24,12 @@ struct Row {
     change: Change,
     #[serde(skip_serializing_if = "serde_json::Map::is_empty")]
     values: serde_json::Map<String, serde_json::Value>,
-    /// Position RMSE [m], and its parts across and along the car.
+    /// Position RMSE \[m\], and its parts across and along the car.
     position_rmse_m: Option<f64>,
     lateral_rmse_m: Option<f64>,
     longitudinal_rmse_m: Option<f64>,
     heading_rmse_rad: Option<f64>,
-    /// Largest error of all seeds [m].
+    /// Largest error of all seeds \[m\].
     position_max_m: Option<f64>,
     excursions: Option<f64>,
     alignment: Option<f64>,

@@ -126,7 +126,7 @@ pub(crate) fn svg(track: &Track) -> String {
     svg
 }
 
-/// Corners of the box around walls and raceline, with a little room [m].
+/// Corners of the box around walls and raceline, with a little room \[m\].
 fn extent(track: &Track) -> [[f64; 2]; 2] {
     let line = track.raceline.points().iter().map(|p| [p.x, p.y]);
     let walls = track

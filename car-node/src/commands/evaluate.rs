@@ -21,7 +21,7 @@ use crate::cli::Evaluate;
 /// The range table of the map, as reported.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct RangeTable {
-    /// Time to build it [ms].
+    /// Time to build it \[ms\].
     build_ms: f64,
     /// Memory that it takes.
     bytes: usize,

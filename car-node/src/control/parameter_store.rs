@@ -44,7 +44,7 @@ pub struct PlannedChange {
     pub parameters: LocalizerParameters,
     /// True when the set is new on the car and must be stored.
     pub store: bool,
-    /// Revert after this time unless confirmed [s].
+    /// Revert after this time unless confirmed \[s\].
     pub revert_after: Option<f64>,
 }
 
@@ -75,7 +75,7 @@ pub enum Refusal {
     },
 }
 
-/// A longer `revert_after` is taken for a mistake [s].
+/// A longer `revert_after` is taken for a mistake \[s\].
 const LONGEST_TRIAL: f64 = 3600.0;
 /// Most sets on one car.
 const MOST_SETS: usize = 64;

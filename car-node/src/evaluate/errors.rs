@@ -6,11 +6,11 @@ use synpf::Stamp;
 
 use crate::statistics::ErrorSummary;
 
-/// Errors in the first seconds are those of the start, and do not count [s].
+/// Errors in the first seconds are those of the start, and do not count \[s\].
 pub(super) const SETTLING: f64 = 2.0;
-/// A position error above this is an excursion [m].
+/// A position error above this is an excursion \[m\].
 const EXCURSION_DISTANCE: f64 = 1.0;
-/// An excursion counts when it lasts this long [s].
+/// An excursion counts when it lasts this long \[s\].
 const EXCURSION_TIME: f64 = 1.0;
 
 /// Collects the errors, estimate by estimate.
@@ -31,13 +31,13 @@ pub struct PoseErrors {
 /// Errors of a whole run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Summaries {
-    /// Distance from the true position [m].
+    /// Distance from the true position \[m\].
     pub position_error_m: ErrorSummary,
-    /// Across the true heading [m].
+    /// Across the true heading \[m\].
     pub lateral_error_m: ErrorSummary,
-    /// Along the true heading [m].
+    /// Along the true heading \[m\].
     pub longitudinal_error_m: ErrorSummary,
-    /// Heading [rad].
+    /// Heading \[rad\].
     pub heading_error_rad: ErrorSummary,
     /// Number of times that the position was wrong by more than 1 m for 1 s or more.
     pub excursions: usize,

@@ -49,9 +49,9 @@ impl FaultKind {
 pub struct Fault {
     /// Its kind.
     pub kind: FaultKind,
-    /// Its start, after the first scan [s].
+    /// Its start, after the first scan \[s\].
     pub at: f64,
-    /// Its duration [s].
+    /// Its duration \[s\].
     pub duration: f64,
 }
 
@@ -96,7 +96,7 @@ impl FromStr for Fault {
 }
 
 impl Fault {
-    /// When it first shows, after the first scan [s]: at its start, or at the end of what it cuts out.
+    /// When it first shows, after the first scan \[s\]: at its start, or at the end of what it cuts out.
     pub fn shows_at(&self) -> f64 {
         if self.kind.cuts() {
             self.at + self.duration
@@ -174,7 +174,7 @@ fn rejoin_odometry(log: &mut SensorLog, cut: Stamp) {
     }
 }
 
-/// Changes every beam of the scans within the fault; `change` gets its direction in the laser's frame [rad].
+/// Changes every beam of the scans within the fault; `change` gets its direction in the laser's frame \[rad\].
 fn on_beams(log: &mut SensorLog, within: impl Fn(Stamp) -> bool, change: impl Fn(f64, &mut f32)) {
     let scans = log
         .arrivals

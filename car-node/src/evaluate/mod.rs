@@ -38,7 +38,7 @@ pub struct AlignmentSummary {
     pub p05: f64,
 }
 
-/// Times of whole updates [us].
+/// Times of whole updates \[us\].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct UpdateTimes {
     /// Median.

@@ -48,7 +48,7 @@ pub enum PoseFileError {
 
 /// Reads poses of `base_link` in `map`. The first line, with or without a `#`, names the columns: `stamp_s x_m y_m
 /// heading_rad` of `base_link`, or `stamp_s laser_x_m laser_y_m laser_yaw_rad` of the laser, which is mounted at
-/// `base_link_from_laser`. Other columns are ignored. Stamps are those of the messages [s].
+/// `base_link_from_laser`. Other columns are ignored. Stamps are those of the messages \[s\].
 ///
 /// # Errors
 /// When the file cannot be read, names no such columns, or a value is no number.

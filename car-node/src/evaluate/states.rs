@@ -10,9 +10,9 @@ use super::Fault;
 use super::errors::SETTLING;
 use crate::health::State;
 
-/// LOCALIZED is right within this distance of the truth [m].
+/// LOCALIZED is right within this distance of the truth \[m\].
 const POSITION: f64 = 0.2;
-/// LOCALIZED is right within this angle of the truth [rad].
+/// LOCALIZED is right within this angle of the truth \[rad\].
 const HEADING: f64 = 2.0 * std::f64::consts::PI / 180.0;
 
 /// How often LOCALIZED and LOST are right, over all updates but those of the first 2 s.
@@ -31,7 +31,7 @@ pub struct StateTruth {
 /// A change of the state.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct StateChange {
-    /// Time since the first scan [s].
+    /// Time since the first scan \[s\].
     pub at_s: f64,
     /// The new state.
     pub state: State,
@@ -44,16 +44,16 @@ pub struct StateChange {
 pub struct FaultReport {
     /// The fault.
     pub fault: String,
-    /// Time from its start to LOST [s]; None if the state was not LOST before the next fault.
+    /// Time from its start to LOST \[s\]; None if the state was not LOST before the next fault.
     pub lost_after_s: Option<f64>,
-    /// Time from its start to STALE [s]; None if the state was not STALE.
+    /// Time from its start to STALE \[s\]; None if the state was not STALE.
     pub stale_after_s: Option<f64>,
-    /// Time from its start to LOCALIZED after LOST or STALE [s]; None if the car was not LOCALIZED again.
+    /// Time from its start to LOCALIZED after LOST or STALE \[s\]; None if the car was not LOCALIZED again.
     pub localized_after_s: Option<f64>,
 }
 
 impl FaultReport {
-    /// From the changes of the state before `until` [s].
+    /// From the changes of the state before `until` \[s\].
     pub fn new(fault: &Fault, until: f64, changes: &[StateChange]) -> Self {
         let during = || {
             changes

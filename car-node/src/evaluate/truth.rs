@@ -10,10 +10,10 @@ pub struct Truth {
     samples: Vec<(Stamp, Pose)>,
 }
 
-/// Across a longer gap the truth is too uncertain to compare an estimate with [s].
+/// Across a longer gap the truth is too uncertain to compare an estimate with \[s\].
 const LONGEST_GAP: f64 = 0.2;
 
-/// Stamps in a text file may be rounded by this much [s].
+/// Stamps in a text file may be rounded by this much \[s\].
 const ROUNDING: f64 = 1e-6;
 
 impl Truth {

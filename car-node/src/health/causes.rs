@@ -10,17 +10,17 @@ use crate::statistics::finite;
 pub(super) struct CauseSources<'a> {
     pub(super) state: State,
     pub(super) thresholds: &'a Thresholds,
-    /// The sensors that have stopped sending, each with how long ago [s].
+    /// The sensors that have stopped sending, each with how long ago \[s\].
     pub(super) silent: Vec<(CauseKind, f64)>,
     /// The localizer refuses every scan.
     pub(super) scans_refused: bool,
-    /// A recent jump of the odometry [m].
+    /// A recent jump of the odometry \[m\].
     pub(super) odometry_jump: Option<f64>,
-    /// A recent jump of a pose that was trusted [m].
+    /// A recent jump of a pose that was trusted \[m\].
     pub(super) pose_jump: Option<f64>,
     /// The localizer has given its pose up.
     pub(super) gave_up: bool,
-    /// For how long scans have repeated [s]; None while they do not.
+    /// For how long scans have repeated \[s\]; None while they do not.
     pub(super) repeating: Option<f64>,
     /// What the localizer has found to be wrong with its sensors.
     pub(super) sensors: SensorFindings,

@@ -8,7 +8,7 @@ use synpf::Update;
 pub struct Metrics {
     /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in [0, 1].
     pub alignment: f64,
-    /// Mean over the same beams of min(distance to the nearest wall, 1 m), smoothed [m].
+    /// Mean over the same beams of min(distance to the nearest wall, 1 m), smoothed \[m\].
     pub residual: f64,
     /// Share of the valid beams more than 0.3 m shorter than on the map, in [0, 1].
     pub short_beams: f64,
@@ -20,9 +20,9 @@ pub struct Metrics {
     pub ess_ratio: f64,
     /// Short-term over long-term average of the fit of the scan; 1 when nothing changes.
     pub w_ratio: f64,
-    /// Standard deviation of the particles along the track [m].
+    /// Standard deviation of the particles along the track \[m\].
     pub spread_along: f64,
-    /// Standard deviation of the particles across the track [m].
+    /// Standard deviation of the particles across the track \[m\].
     pub spread_across: f64,
     /// Mass of the second cluster over that of the first, in [0, 1].
     pub second_mode: f64,
@@ -30,13 +30,13 @@ pub struct Metrics {
     pub slip: f64,
     /// Odometry's yaw rate minus the posterior's [rad/s].
     pub yaw_rate_residual: f64,
-    /// Distance by which the scan corrected the pose [m].
+    /// Distance by which the scan corrected the pose \[m\].
     pub innovation: f64,
-    /// Angle by which the scan corrected the pose [rad].
+    /// Angle by which the scan corrected the pose \[rad\].
     pub innovation_angle: f64,
-    /// Median age of poses over the last second [s].
+    /// Median age of poses over the last second \[s\].
     pub age_p50: f64,
-    /// 99th percentile of the age of poses over the last second [s].
+    /// 99th percentile of the age of poses over the last second \[s\].
     pub age_p99: f64,
     /// Particles in use.
     pub particles: usize,

@@ -26,7 +26,7 @@ pub struct Verdict {
     pub metrics: Option<Metrics>,
 }
 
-/// A jump of the odometry or of the pose stays in the list of causes for this long [s].
+/// A jump of the odometry or of the pose stays in the list of causes for this long \[s\].
 const JUMP_SHOWN: f64 = 3.0;
 
 /// Judges one localizer, update by update.
@@ -49,7 +49,7 @@ pub struct Monitor {
     gave_up: bool,
     /// Since when nothing has been wrong.
     good_since: Option<Stamp>,
-    /// Distance driven since the state was entered and since anything was wrong [m].
+    /// Distance driven since the state was entered and since anything was wrong \[m\].
     driven: f64,
     last_update: Option<Stamp>,
     /// Since when every scan has been refused, and when the last one was.
@@ -59,9 +59,9 @@ pub struct Monitor {
     /// What the localizer has found to be wrong with its sensors.
     sensors: SensorFindings,
     ages: PoseAges,
-    /// The last jump of the odometry: when, and how far [m].
+    /// The last jump of the odometry: when, and how far \[m\].
     odometry_jump: Option<(Stamp, f64)>,
-    /// The last jump of a pose that was trusted: when, and how far [m].
+    /// The last jump of a pose that was trusted: when, and how far \[m\].
     pose_jump: Option<(Stamp, f64)>,
     /// The state is LOST because the localizer gave its pose up, by a jump or a search, and for nothing else.
     given_up: bool,
@@ -278,7 +278,7 @@ impl Monitor {
         }
     }
 
-    /// How far a trusted pose jumped with one scan [m]; None if it did not. After a silence a jump is no fault.
+    /// How far a trusted pose jumped with one scan \[m\]; None if it did not. After a silence a jump is no fault.
     fn pose_jump(&self, update: &Update) -> Option<f64> {
         let trusted = matches!(self.verdict.state, State::Localized | State::Degraded);
         let next = self
@@ -338,7 +338,7 @@ impl Monitor {
         finding.degrades && (finding.at_once || lasted())
     }
 
-    /// The sensors that have stopped sending, each with how long ago [s].
+    /// The sensors that have stopped sending, each with how long ago \[s\].
     fn silent(&self, now: Stamp) -> Vec<(CauseKind, f64)> {
         self.silence
             .silent(now, self.verdict.since, self.thresholds.stale_after)
@@ -386,7 +386,7 @@ mod tests {
         monitor: Monitor,
         now: Stamp,
         number: u64,
-        /// From one scan to the next [s].
+        /// From one scan to the next \[s\].
         period: f64,
     }
 

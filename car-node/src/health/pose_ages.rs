@@ -6,13 +6,13 @@ use synpf::Stamp;
 
 use crate::statistics::percentile;
 
-/// Ages are summarized over this long [s].
+/// Ages are summarized over this long \[s\].
 const WINDOW: f64 = 1.0;
 
 /// The ages of the poses of the last second.
 #[derive(Debug, Default)]
 pub(super) struct PoseAges {
-    /// When each pose was ready, and its age then [s].
+    /// When each pose was ready, and its age then \[s\].
     ages: VecDeque<(Stamp, f64)>,
 }
 
@@ -23,7 +23,7 @@ impl PoseAges {
         self.ages.retain(|(ready, _)| now.since(*ready) <= WINDOW);
     }
 
-    /// Median and 99th percentile [s]; 0 before the first pose.
+    /// Median and 99th percentile \[s\]; 0 before the first pose.
     pub(super) fn percentiles(&self) -> [f64; 2] {
         let ages: Vec<f64> = self.ages.iter().map(|(_, age)| *age).collect();
         [0.5, 0.99].map(|share| percentile(&ages, share).unwrap_or_default())

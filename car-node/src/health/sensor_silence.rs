@@ -22,7 +22,7 @@ impl SensorSilence {
         self.last_odometry = Some(now);
     }
 
-    /// The sensors that have been silent for longer than `limit` [s], each with how long [s]. A sensor that has never sent
+    /// The sensors that have been silent for longer than `limit` \[s\], each with how long \[s\]. A sensor that has never sent
     /// counts as silent since `start`.
     pub(super) fn silent(&self, now: Stamp, start: Stamp, limit: f64) -> Vec<(CauseKind, f64)> {
         [

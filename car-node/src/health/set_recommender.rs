@@ -18,9 +18,9 @@ pub struct Proposal {
     pub since: Stamp,
 }
 
-/// Odometry is judged over this long, about a lap of a small track [s].
+/// Odometry is judged over this long, about a lap of a small track \[s\].
 const WINDOW: f64 = 8.0;
-/// No proposal before the window is filled this far [s].
+/// No proposal before the window is filled this far \[s\].
 const ENOUGH: f64 = 3.0;
 /// LQ is proposed when odometry was wrong at more than this share of the scans.
 const SLIPPING: f64 = 0.20;

@@ -4,11 +4,11 @@ use synpf::{Stamp, Update};
 
 use super::Thresholds;
 
-/// A slip is reported after this long [s]. A start from standstill is over sooner.
+/// A slip is reported after this long \[s\]. A start from standstill is over sooner.
 const SLIP_TIME: f64 = 0.3;
 /// The wheels grip when the slip is below this share of the threshold.
 const GRIP_SHARE: f64 = 0.6;
-/// A slip has ended when the wheels grip for this long [s].
+/// A slip has ended when the wheels grip for this long \[s\].
 const GRIP_TIME: f64 = 1.0;
 /// Slip is not judged below this speed [m/s]: it is a share of a distance that is too short.
 const SLOWEST: f64 = 1.0;
@@ -25,7 +25,7 @@ pub enum SlipEvent {
     Ended {
         /// The slip of the largest magnitude.
         worst: f64,
-        /// How long it lasted [s].
+        /// How long it lasted \[s\].
         duration: f64,
     },
 }

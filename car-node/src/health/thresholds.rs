@@ -17,10 +17,10 @@ pub struct Thresholds {
     pub alignment_lost: f64,
     /// Clear alignment below this is a wrong pose, without other evidence, in [0, 1].
     pub alignment_wrong: f64,
-    /// Residual above this is degraded [m]. A little above the middle of right and wrong poses of `als_ros` (0.165 and
+    /// Residual above this is degraded \[m\]. A little above the middle of right and wrong poses of `als_ros` (0.165 and
     /// 0.299 m): real maps are older than theirs.
     pub residual_degraded: f64,
-    /// Residual above this is evidence of a wrong pose [m].
+    /// Residual above this is evidence of a wrong pose \[m\].
     pub residual_lost: f64,
     /// Hysteresis: the state is good again once the alignment is better than its limit by this, and the residual by this share.
     pub hysteresis: f64,
@@ -38,9 +38,9 @@ pub struct Thresholds {
     pub ess_info: f64,
     /// A `w_ratio` below this is reported. It is computed from the alignment, so it is no further evidence.
     pub w_ratio_info: f64,
-    /// Spread across the track above this is degraded [m].
+    /// Spread across the track above this is degraded \[m\].
     pub spread_across_degraded: f64,
-    /// Spread along the track above this is degraded [m].
+    /// Spread along the track above this is degraded \[m\].
     pub spread_along_degraded: f64,
     /// Second mode over the first above this is degraded.
     pub second_mode_degraded: f64,
@@ -52,31 +52,31 @@ pub struct Thresholds {
     pub slip_severe: f64,
     /// Magnitude of the yaw-rate residual above this is reported [rad/s].
     pub yaw_rate_residual: f64,
-    /// A correction above this is degraded [m].
+    /// A correction above this is degraded \[m\].
     pub innovation: f64,
-    /// A correction above this is degraded [rad].
+    /// A correction above this is degraded \[rad\].
     pub innovation_angle: f64,
-    /// A correction by one scan above this means that the pose was wrong before [m].
+    /// A correction by one scan above this means that the pose was wrong before \[m\].
     pub leap: f64,
-    /// Median age of poses above this is degraded [s]. A busy car has 40 ms: a scan arrives 17 to 22 ms after its stamp.
+    /// Median age of poses above this is degraded \[s\]. A busy car has 40 ms: a scan arrives 17 to 22 ms after its stamp.
     pub age: f64,
-    /// Sensor data is missing after this long [s]. A real log has harmless gaps of 0.14 s in its odometry.
+    /// Sensor data is missing after this long \[s\]. A real log has harmless gaps of 0.14 s in its odometry.
     pub stale_after: f64,
-    /// Time constant with which the fit is smoothed before it degrades the state [s].
+    /// Time constant with which the fit is smoothed before it degrades the state \[s\].
     pub smoothing: f64,
-    /// Time constant with which the fit is smoothed before it is evidence of a wrong pose [s].
+    /// Time constant with which the fit is smoothed before it is evidence of a wrong pose \[s\].
     pub smoothing_lost: f64,
-    /// A metric degrades the state when every update of this long was bad [s].
+    /// A metric degrades the state when every update of this long was bad \[s\].
     pub bad_for: f64,
-    /// Two families of evidence against the pose for this long mean lost [s].
+    /// Two families of evidence against the pose for this long mean lost \[s\].
     pub lost_after: f64,
-    /// Alignment below `alignment_wrong` for this long means lost [s].
+    /// Alignment below `alignment_wrong` for this long means lost \[s\].
     pub wrong_after: f64,
-    /// Alignment below `alignment_lost` alone for this long means lost [s].
+    /// Alignment below `alignment_lost` alone for this long means lost \[s\].
     pub alone_after: f64,
-    /// The state recovers when everything was good for this long [s].
+    /// The state recovers when everything was good for this long \[s\].
     pub good_for: f64,
-    /// A new pose is confirmed when everything was good while the car drove this far [m].
+    /// A new pose is confirmed when everything was good while the car drove this far \[m\].
     pub confirmed_after: f64,
 }
 

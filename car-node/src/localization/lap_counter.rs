@@ -11,7 +11,7 @@ const WRAP: f64 = 0.5;
 pub struct Crossing {
     /// The lap that ended; 0 for the first crossing, which ends no whole lap.
     pub ended: u32,
-    /// Its time [s]; None for the first crossing.
+    /// Its time \[s\]; None for the first crossing.
     pub time: Option<f64>,
 }
 

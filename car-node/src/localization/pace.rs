@@ -9,7 +9,7 @@ pub(super) struct Pace {
 }
 
 impl Pace {
-    /// True when something at `rate` [Hz] is due. The caller then does it.
+    /// True when something at `rate` \[Hz\] is due. The caller then does it.
     pub(super) fn due(&mut self, now: Stamp, rate: f32) -> bool {
         if rate <= 0.0 {
             return false;

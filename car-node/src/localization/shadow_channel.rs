@@ -27,7 +27,7 @@ pub struct ShadowScan {
     pub scan: Scan,
     /// The update.
     pub update: Update,
-    /// Time of the update [s].
+    /// Time of the update \[s\].
     pub taken: f64,
     /// Messages that waited for the filter meanwhile.
     pub queued: usize,

@@ -5,9 +5,9 @@ use synpf::{Scan, TrackMap, Update, WeightedPose};
 
 use crate::telemetry::queue::{BeamClass, CloudSample, ScanPoints};
 
-/// End points nearer to a wall than this are on it [m]; the limit of [`Update::alignment`].
+/// End points nearer to a wall than this are on it \[m\]; the limit of [`Update::alignment`].
 const ON_WALL: f64 = 0.10;
-/// Beams that differ from the map by more than this are short or long [m]; the limit of [`Update::long_beams`].
+/// Beams that differ from the map by more than this are short or long \[m\]; the limit of [`Update::long_beams`].
 const SHORT_OR_LONG: f64 = 0.3;
 
 /// The particles of an update; `particles` is a fair sample of them.
@@ -56,8 +56,8 @@ pub(super) fn scan_points(
     }
 }
 
-/// Compares a beam with the map. `distance` is that of its end point to the nearest wall [m]; `longer` is its range less
-/// the expected one [m].
+/// Compares a beam with the map. `distance` is that of its end point to the nearest wall \[m\]; `longer` is its range less
+/// the expected one \[m\].
 fn classify_beam(distance: f64, longer: f64) -> BeamClass {
     if distance.abs() < ON_WALL {
         BeamClass::OnWall

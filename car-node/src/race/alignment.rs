@@ -3,7 +3,7 @@
 use maps::Pose;
 use synpf::{Scan, TrackMap};
 
-/// An end point nearer than this to the boundary is aligned [m].
+/// An end point nearer than this to the boundary is aligned \[m\].
 pub const PAPER_DISTANCE: f64 = 0.22;
 
 /// Number of beams used.

@@ -79,7 +79,7 @@ pub struct RaceSetup {
     pub seed: u64,
 }
 
-/// Gap between two cars at the start, along the raceline [m].
+/// Gap between two cars at the start, along the raceline \[m\].
 const GRID_GAP: f64 = 3.0;
 
 /// Runs a race until all laps are driven, or four times their expected time has passed. `map` is the track's map, prepared

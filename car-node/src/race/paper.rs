@@ -13,9 +13,9 @@ pub struct PaperRow {
     pub localizer: &'static str,
     /// The tyres.
     pub quality: Quality,
-    /// Lap time, mean and sigma [s].
+    /// Lap time, mean and sigma \[s\].
     pub lap_time_s: [f64; 2],
-    /// Mean distance of the estimate from the raceline, mean and sigma over the laps [m].
+    /// Mean distance of the estimate from the raceline, mean and sigma over the laps \[m\].
     pub line_error_m: [f64; 2],
     /// Scan alignment, in [0, 1].
     pub alignment: f64,

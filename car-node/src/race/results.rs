@@ -17,11 +17,11 @@ use crate::statistics::{MeanSigma, mean, percentile};
 /// One finished lap.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct LapRecord {
-    /// Lap time [s].
+    /// Lap time \[s\].
     pub time_s: f64,
-    /// Mean distance of the *estimate* from the raceline, as the paper defines it [m].
+    /// Mean distance of the *estimate* from the raceline, as the paper defines it \[m\].
     pub line_error_m: f64,
-    /// Mean distance of the car from the raceline [m].
+    /// Mean distance of the car from the raceline \[m\].
     pub true_line_error_m: f64,
     /// Mean scan alignment by the paper's definition, in [0, 1].
     pub alignment_paper: f64,
@@ -32,9 +32,9 @@ pub struct LapRecord {
 pub struct LoadSummary {
     /// CPU seconds of the localizer per second of the race.
     pub cpu: f64,
-    /// Whole update, median [us].
+    /// Whole update, median \[us\].
     pub update_us_p50: f64,
-    /// Whole update, 99th percentile [us].
+    /// Whole update, 99th percentile \[us\].
     pub update_us_p99: f64,
     /// Seconds of the race per second of computing, with the simulator.
     pub real_time_factor: f64,
@@ -57,19 +57,19 @@ pub enum MishapKind {
 /// A mishap, with values that show its cause.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Mishap {
-    /// Time since the start of the race [s].
+    /// Time since the start of the race \[s\].
     pub at_s: f64,
     /// Its kind.
     pub kind: MishapKind,
-    /// Arc length along the raceline [m].
+    /// Arc length along the raceline \[m\].
     pub s_m: f64,
-    /// Distance from the raceline, left positive [m].
+    /// Distance from the raceline, left positive \[m\].
     pub d_m: f64,
     /// Speed of the impact [m/s].
     pub impact_mps: f64,
     /// False while the car was being turned round after a spin.
     pub racing: bool,
-    /// Error of the estimate at the last scan [m]; None without one.
+    /// Error of the estimate at the last scan \[m\]; None without one.
     pub pose_error_m: Option<f64>,
 }
 
@@ -100,7 +100,7 @@ pub struct CarResult {
     pub state_truth: Option<StateTruth>,
     /// Searches of the map: the localizer gave its pose up.
     pub searches: usize,
-    /// Duration of the race [s].
+    /// Duration of the race \[s\].
     pub race_s: f64,
     /// Load on this machine; differs from run to run.
     pub load: LoadSummary,
@@ -115,17 +115,17 @@ pub struct RaceSummary {
     pub started: usize,
     /// Laps driven.
     pub laps: usize,
-    /// Lap time [s].
+    /// Lap time \[s\].
     pub lap_time_s: Option<MeanSigma>,
-    /// Per lap: mean distance of the estimate from the raceline [m].
+    /// Per lap: mean distance of the estimate from the raceline \[m\].
     pub line_error_m: Option<MeanSigma>,
-    /// Per lap: mean distance of the car from the raceline [m].
+    /// Per lap: mean distance of the car from the raceline \[m\].
     pub true_line_error_m: Option<MeanSigma>,
-    /// Root mean square of the position error over the cars [m].
+    /// Root mean square of the position error over the cars \[m\].
     pub position_rmse_m: Option<f64>,
-    /// Largest position error [m].
+    /// Largest position error \[m\].
     pub position_max_m: Option<f64>,
-    /// Root mean square of the heading error [rad].
+    /// Root mean square of the heading error \[rad\].
     pub heading_rmse_rad: Option<f64>,
     /// Scan alignment by the paper's definition, in [0, 1].
     pub alignment_paper: Option<f64>,
@@ -209,7 +209,7 @@ pub(super) struct CarMeasurements {
     map: Arc<TrackMap>,
     finished: Vec<LapRecord>,
     mishaps: Vec<Mishap>,
-    /// Error of the estimate at the last scan [m].
+    /// Error of the estimate at the last scan \[m\].
     pose_error: Option<f64>,
     /// True once the car has crossed the start line. The way there belongs to no lap.
     pub(super) on_a_lap: bool,
@@ -265,7 +265,7 @@ impl CarMeasurements {
         result
     }
 
-    /// The driver got `estimate`, and the car was `true_d` [m] from the raceline.
+    /// The driver got `estimate`, and the car was `true_d` \[m\] from the raceline.
     pub(super) fn driven(&mut self, estimate: Pose, true_d: f64) {
         if !self.on_a_lap {
             return;

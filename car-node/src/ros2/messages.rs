@@ -83,21 +83,21 @@ pub struct Header {
 pub struct LaserScan {
     /// Time of the first beam, frame of the laser.
     pub header: Header,
-    /// Direction of the first beam [rad].
+    /// Direction of the first beam \[rad\].
     pub angle_min: f32,
-    /// Direction of the last beam [rad].
+    /// Direction of the last beam \[rad\].
     pub angle_max: f32,
-    /// From one beam to the next [rad].
+    /// From one beam to the next \[rad\].
     pub angle_increment: f32,
-    /// From one beam to the next [s].
+    /// From one beam to the next \[s\].
     pub time_increment: f32,
-    /// From one scan to the next [s].
+    /// From one scan to the next \[s\].
     pub scan_time: f32,
-    /// Least valid range [m].
+    /// Least valid range \[m\].
     pub range_min: f32,
-    /// Largest valid range [m].
+    /// Largest valid range \[m\].
     pub range_max: f32,
-    /// One range per beam [m].
+    /// One range per beam \[m\].
     pub ranges: Vec<f32>,
     /// One intensity per beam, or none (device units).
     pub intensities: Vec<f32>,
@@ -152,13 +152,13 @@ impl Default for Orientation {
 }
 
 impl Orientation {
-    /// A turn about z [rad].
+    /// A turn about z \[rad\].
     pub fn from_yaw(yaw: f64) -> Self {
         let (z, w) = (yaw / 2.0).sin_cos();
         Self { x: 0.0, y: 0.0, z, w }
     }
 
-    /// The turn about z [rad]; NaN for the quaternion of zeros that a publisher sends who never sets it.
+    /// The turn about z \[rad\]; NaN for the quaternion of zeros that a publisher sends who never sets it.
     fn yaw(self) -> f64 {
         let Self { x, y, z, w } = self;
         if x * x + y * y + z * z + w * w < 1e-6 {
@@ -171,7 +171,7 @@ impl Orientation {
 /// `geometry_msgs/Pose` and, with its translation as the position, `geometry_msgs/Transform`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct RosPose {
-    /// Position [m].
+    /// Position \[m\].
     pub position: Vector3,
     /// Orientation.
     pub orientation: Orientation,
@@ -301,7 +301,7 @@ pub struct PoseWithCovarianceStamped {
 pub struct PointStamped {
     /// Time and frame.
     pub header: Header,
-    /// The point [m].
+    /// The point \[m\].
     pub point: Vector3,
 }
 

@@ -231,10 +231,10 @@ impl SensorLog {
         Some([first, scans.next_back().unwrap_or(first)])
     }
 
-    /// Keeps the part that starts `from` after the first scan and lasts `lasting` [s], with the odometry just before its first
+    /// Keeps the part that starts `from` after the first scan and lasts `lasting` \[s\], with the odometry just before its first
     /// scan. A log without a scan stays as it is.
     pub fn keep(&mut self, from: f64, lasting: f64) {
-        /// Odometry this long before the part is kept [s].
+        /// Odometry this long before the part is kept \[s\].
         const LEAD: f64 = 0.2;
         let Some([first, _]) = self.span() else {
             return;

@@ -34,7 +34,7 @@ impl SensorClock {
         self.sensor.plus(self.started.elapsed().as_secs_f64() * self.rate)
     }
 
-    /// Wall time [unix] at which the sensors' clock shows `stamp`.
+    /// Wall time \[unix\] at which the sensors' clock shows `stamp`.
     pub fn wall(&self, stamp: Stamp) -> Stamp {
         self.wall.plus(stamp.since(self.sensor) / self.rate)
     }
@@ -45,7 +45,7 @@ impl SensorClock {
     }
 }
 
-/// Wall time now [unix].
+/// Wall time now \[unix\].
 pub fn wall_now() -> Stamp {
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     Stamp(i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX))

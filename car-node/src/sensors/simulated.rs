@@ -84,7 +84,7 @@ pub struct Race {
 
 /// A car that does not pick up its messages keeps this many.
 const MOST_WAITING: usize = 1024;
-/// Messages later than this are of a time before the car joined [s].
+/// Messages later than this are of a time before the car joined \[s\].
 const TOO_LATE: f64 = 0.5;
 
 impl Race {

@@ -9,14 +9,14 @@ use synpf::Dropped;
 use crate::sensors::bag::SensorEvent;
 use crate::statistics::{MeanSigma, percentile};
 
-/// Median, 99th percentile and maximum of a duration [s].
+/// Median, 99th percentile and maximum of a duration \[s\].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Spread {
-    /// Median [s].
+    /// Median \[s\].
     pub p50: f64,
-    /// 99th percentile [s].
+    /// 99th percentile \[s\].
     pub p99: f64,
-    /// Maximum [s].
+    /// Maximum \[s\].
     pub max: f64,
 }
 
@@ -37,7 +37,7 @@ struct MeterInterval {
     update_times: Vec<f64>,
     scan_ages: Vec<f64>,
     publish_lags: Vec<f64>,
-    /// Arrivals of scans, on the sensors' clock [s].
+    /// Arrivals of scans, on the sensors' clock \[s\].
     scans: Vec<f64>,
     odometry: usize,
     dropped: BTreeMap<Dropped, u64>,
@@ -58,7 +58,7 @@ pub struct Reading {
     pub odometry: usize,
     /// Updates since the last reading.
     pub updates: usize,
-    /// Standard deviation of the time between scans [s].
+    /// Standard deviation of the time between scans \[s\].
     pub scan_jitter: f64,
     /// Messages waiting for the filter.
     pub queued: usize,
@@ -87,7 +87,7 @@ impl Counters {
         change(&mut self.interval.lock().unwrap_or_else(PoisonError::into_inner));
     }
 
-    /// A message reached the filter at `now` [s], `age` [s] after its stamp. `queued` more are waiting.
+    /// A message reached the filter at `now` \[s\], `age` \[s\] after its stamp. `queued` more are waiting.
     pub fn arrived(&self, event: &SensorEvent, age: f64, now: f64, queued: usize) {
         self.queued.store(queued, Ordering::Relaxed);
         self.with(|interval| match event {
@@ -105,12 +105,12 @@ impl Counters {
         self.with(|interval| *interval.dropped.entry(cause).or_default() += 1);
     }
 
-    /// A whole update took this long [s].
+    /// A whole update took this long \[s\].
     pub fn updated(&self, time: f64) {
         self.with(|interval| push(&mut interval.update_times, time));
     }
 
-    /// A pose was handed to the network this long after its time [s].
+    /// A pose was handed to the network this long after its time \[s\].
     pub fn published(&self, lag: f64) {
         self.with(|interval| push(&mut interval.publish_lags, lag));
     }

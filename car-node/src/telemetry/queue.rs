@@ -47,7 +47,7 @@ pub struct CloudSample {
     pub count: usize,
     /// Effective sample size over `count`.
     pub ess_ratio: f64,
-    /// Standard deviation along and across the track [m].
+    /// Standard deviation along and across the track \[m\].
     pub spread: [f64; 2],
     /// Second mode over the first.
     pub second_mode: f64,
@@ -75,9 +75,9 @@ pub struct ScanPoints {
     pub stamp: Stamp,
     /// The update that it led to.
     pub update: u64,
-    /// Where the laser is [m].
+    /// Where the laser is \[m\].
     pub centre: [f64; 2],
-    /// End points in `map` [m].
+    /// End points in `map` \[m\].
     pub points: Vec<([f64; 2], BeamClass)>,
 }
 

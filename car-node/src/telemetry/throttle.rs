@@ -6,22 +6,22 @@ use std::collections::VecDeque;
 use protocol::{LinkReport, Rates};
 use synpf::Stamp;
 
-/// The link is slow when poses arrive later than this [s].
+/// The link is slow when poses arrive later than this \[s\].
 const SLOW: f64 = 0.25;
-/// Rates are lowered when the link was slow for this long [s].
+/// Rates are lowered when the link was slow for this long \[s\].
 const SLOW_FOR: f64 = 2.0;
-/// When lower rates have not helped for this long, the full-rate streams for the recorder stay on the car, too [s]. The pit
+/// When lower rates have not helped for this long, the full-rate streams for the recorder stay on the car, too \[s\]. The pit
 /// wall requests them later, at the pace of the link.
 const STILL_SLOW_FOR: f64 = 3.0;
-/// The link is fast when poses arrive sooner than this [s].
+/// The link is fast when poses arrive sooner than this \[s\].
 const FAST: f64 = 0.1;
-/// Rates are restored when the link was fast for this long [s].
+/// Rates are restored when the link was fast for this long \[s\].
 const FAST_FOR: f64 = 5.0;
-/// That time doubles, up to this, each time the link becomes slow again after the rates were restored [s].
+/// That time doubles, up to this, each time the link becomes slow again after the rates were restored \[s\].
 const FAST_FOR_AT_MOST: f64 = 80.0;
-/// Slow again within this time means that the full rates are what slows the link [s].
+/// Slow again within this time means that the full rates are what slows the link \[s\].
 const AGAIN: f64 = 20.0;
-/// A report is valid for this long [s].
+/// A report is valid for this long \[s\].
 const KEEP: f64 = 3.0;
 /// The highest rates on a slow link.
 const LOWERED: Rates = Rates {
@@ -37,7 +37,7 @@ const LOWERED: Rates = Rates {
 pub enum Change {
     /// The rates are lowered.
     Lowered {
-        /// From publishing a pose to its arrival [s].
+        /// From publishing a pose to its arrival \[s\].
         transit: f64,
         /// The highest rates.
         rates: Rates,
@@ -49,13 +49,13 @@ pub enum Change {
 /// Judges the link by the reports of the pit walls.
 #[derive(Debug, Default)]
 pub struct Throttle {
-    /// The last reports of all pit walls: time of the report, and how late poses arrive [s].
+    /// The last reports of all pit walls: time of the report, and how late poses arrive \[s\].
     reports: VecDeque<(Stamp, f64)>,
     slow_since: Option<Stamp>,
     fast_since: Option<Stamp>,
     /// The highest rates; None without a limit.
     lowered: Option<Rates>,
-    /// When the rates were last restored, and how long the link had to be fast before [s].
+    /// When the rates were last restored, and how long the link had to be fast before \[s\].
     restored: Option<(Stamp, f64)>,
 }
 
@@ -134,7 +134,7 @@ mod tests {
     use super::*;
     use crate::telemetry::shared_state::DEFAULT_RATES;
 
-    /// Reports once a second for `seconds`, from pit walls with these transit times [s].
+    /// Reports once a second for `seconds`, from pit walls with these transit times \[s\].
     fn report(throttle: &mut Throttle, from: u32, seconds: u32, transits: &[f32]) -> Vec<Change> {
         (from..from + seconds)
             .flat_map(|second| transits.iter().map(move |transit| (second, *transit)))

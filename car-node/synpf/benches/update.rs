@@ -21,7 +21,7 @@ use synpf::{Parameters, Scan, Stage, SynPf, TrackMap};
 struct Drive {
     localizer: SynPf,
     scans: Vec<Scan>,
-    /// Between two scans [s].
+    /// Between two scans \[s\].
     period: f64,
     step: usize,
     odom: f64,

@@ -50,7 +50,7 @@ impl BeamParameters {
 /// Most beams that are weighed, so that their directions and rows of the beam model fit on the stack.
 pub(crate) const MOST_BEAMS: usize = 128;
 
-/// The choice of beams for a scan's geometry: `count` beams from `angle_min` on, `increment` apart [rad].
+/// The choice of beams for a scan's geometry: `count` beams from `angle_min` on, `increment` apart \[rad\].
 pub(crate) fn chosen_beams(
     count: usize,
     angle_min: f64,

@@ -15,7 +15,7 @@ use crate::sensor_parameters::SensorParameters;
 /// A step of the model is this power of two of the range table's units: 2 cm.
 const STEP_SHIFT: u32 = 3;
 
-/// Length of a step [m].
+/// Length of a step \[m\].
 const STEP: f64 = UNIT as f64 * (1 << STEP_SHIFT) as f64;
 
 /// Possible lengths of a row: up to 20 m, 41 m, and the most that 16 bits hold. A length known at compile time saves the
@@ -122,12 +122,12 @@ impl BeamModel {
         }
     }
 
-    /// The row for a measured range [m]; infinite for no return. `N` is [`BeamModel::row_length`].
+    /// The row for a measured range \[m\]; infinite for no return. `N` is [`BeamModel::row_length`].
     fn fixed_row<const N: usize>(&self, measured: f32) -> &[f32; N] {
         self.row(measured).try_into().expect("N is the rows' length")
     }
 
-    /// The row for a measured range [m]; infinite for no return.
+    /// The row for a measured range \[m\]; infinite for no return.
     fn row(&self, measured: f32) -> &[f32] {
         let step = ((f64::from(measured) / STEP).round() as usize).min(self.steps - 1);
         &self.rows[step * self.length..(step + 1) * self.length]
@@ -138,12 +138,12 @@ impl BeamModel {
         self.length
     }
 
-    /// The greatest range that differs from no return [m].
+    /// The greatest range that differs from no return \[m\].
     fn reach(&self) -> f32 {
         ((self.steps - 1) as f64 * STEP) as f32
     }
 
-    /// The step of a predicted range in cells of `resolution` [m].
+    /// The step of a predicted range in cells of `resolution` \[m\].
     fn step_of(&self, cells: f32, resolution: f32) -> usize {
         ((cells * resolution / STEP as f32) as usize).min(self.steps - 1)
     }
@@ -153,9 +153,9 @@ impl BeamModel {
 struct Laser {
     /// Cells per metre.
     cells: f32,
-    /// Position [cells].
+    /// Position \[cells\].
     at: [f32; 2],
-    /// Heading [rad].
+    /// Heading \[rad\].
     heading: f32,
 }
 
@@ -172,7 +172,7 @@ impl Laser {
         }
     }
 
-    /// Position of the laser of particle `i` in the grid [cells].
+    /// Position of the laser of particle `i` in the grid \[cells\].
     #[inline]
     fn of(&self, poses: &PoseArray, i: usize) -> [f32; 2] {
         let (c, s) = (poses.cos()[i], poses.sin()[i]);
@@ -246,8 +246,8 @@ fn reweight_by_table<const N: usize>(
     }
 }
 
-/// Adds the log-likelihoods of ranges that `cast` computes from a point [cells] along an angle [rad], up to a longest
-/// range [cells].
+/// Adds the log-likelihoods of ranges that `cast` computes from a point \[cells\] along an angle \[rad\], up to a longest
+/// range \[cells\].
 fn reweight_by_casting(
     particles: &mut Particles,
     beams: &[Beam],

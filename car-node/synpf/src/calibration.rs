@@ -37,7 +37,7 @@ impl Calibration {
         self.slip_model.forget_pose();
     }
 
-    /// Covariance of a pose for a scan whose beams were measured over `sweep` [s] and brought to one time: half of it at the
+    /// Covariance of a pose for a scan whose beams were measured over `sweep` \[s\] and brought to one time: half of it at the
     /// velocity that calibrated odometry gets wrong. In the frame of `base_link`.
     pub(crate) fn sweep_error(&self, sweep: f64) -> Matrix3<f64> {
         let sigma = Vector3::from(self.slip.unforeseen) * (0.5 * sweep);
@@ -65,7 +65,7 @@ impl Calibration {
         }
     }
 
-    /// Learns from one scan's end points at the estimate how the walls stand, after `driven` [m]. With `distance` 0
+    /// Learns from one scan's end points at the estimate how the walls stand, after `driven` \[m\]. With `distance` 0
     /// nothing is learned: walls stand where the map has them.
     pub(crate) fn learn_walls(
         &mut self,

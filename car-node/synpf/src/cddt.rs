@@ -34,7 +34,7 @@ impl Cddt {
         }
     }
 
-    /// Range from a point along an angle [cells], at most `longest`.
+    /// Range from a point along an angle \[cells\], at most `longest`.
     pub(crate) fn range(&self, from: [f32; 2], angle: f32, longest: f32) -> f32 {
         let step = (angle * (HALF_TURN as f32 / std::f32::consts::PI)).round() as i64;
         let k = step.rem_euclid(DIRECTIONS as i64) as usize;
@@ -42,7 +42,7 @@ impl Cddt {
         if k < HALF_TURN { ahead } else { behind }.min(longest)
     }
 
-    /// An upper bound of the memory that a CDDT of a field takes [bytes], known before it is built.
+    /// An upper bound of the memory that a CDDT of a field takes \[bytes\], known before it is built.
     pub(crate) fn bytes_at_most(field: &DistanceField) -> usize {
         let faces = field.contour();
         // A face of length l crosses the middles of at most l lanes, and one more.
@@ -63,7 +63,7 @@ impl Cddt {
         HALF_TURN * (blocks * size_of::<CrossingBlock>() + (lanes + 1) * size_of::<u32>())
     }
 
-    /// Memory that it takes [bytes].
+    /// Memory that it takes \[bytes\].
     pub(crate) fn bytes(&self) -> usize {
         let bytes = |slice: &CddtSlice| size_of_val(&*slice.starts) + size_of_val(&*slice.blocks);
         self.directions.iter().map(bytes).sum()
@@ -88,7 +88,7 @@ pub(crate) struct CddtSlice {
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
     lane: u32,
-    /// Place along the lane's middle [cells].
+    /// Place along the lane's middle \[cells\].
     at: f32,
     /// How the place moves across the lane [cells per lane].
     slope: f32,
@@ -173,7 +173,7 @@ impl CddtSlice {
         }
     }
 
-    /// Ranges from a point ahead along the lanes and behind [cells]; infinite where no wall is met.
+    /// Ranges from a point ahead along the lanes and behind \[cells\]; infinite where no wall is met.
     #[inline]
     pub(crate) fn ranges(&self, from: [f32; 2]) -> [f32; 2] {
         let lane = (from[1] * self.along[0] - from[0] * self.along[1]) * FINE - self.first;

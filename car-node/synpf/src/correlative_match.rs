@@ -23,20 +23,20 @@ const COARSE: usize = 8_000;
 /// Fine poses that are looked through for the best of each neighbourhood.
 const FINE: usize = 6000;
 
-/// A car is nowhere nearer to a wall than this [m].
+/// A car is nowhere nearer to a wall than this \[m\].
 const CLEARANCE: f32 = 0.12;
 
-/// Seeds nearer to each other than this are one [m], [rad].
+/// Seeds nearer to each other than this are one \[m\], \[rad\].
 const NEIGHBOURHOOD: [f64; 2] = [0.45, 0.3];
 
 /// Neighbouring positions of the fine grid.
 struct Block {
-    /// Their middle [m].
+    /// Their middle \[m\].
     centre: [f32; 2],
     positions: Range<usize>,
 }
 
-/// The positions where the car can be [m], in blocks of up to two by two.
+/// The positions where the car can be \[m\], in blocks of up to two by two.
 fn blocks(map: &TrackMap, search_step: f64) -> (Vec<Block>, Vec<[f32; 2]>) {
     let resolution = map.grid().resolution;
     let width = map.grid().width;
@@ -80,7 +80,7 @@ fn best<T>(matches: &mut Vec<(u32, T)>, most: usize) {
     matches.truncate(most);
 }
 
-/// Poses that a scan with these end points [m], in the car's frame, may have been taken at, the best match first: three for
+/// Poses that a scan with these end points \[m\], in the car's frame, may have been taken at, the best match first: three for
 /// every candidate that is wanted. The same whatever the number of threads.
 pub(crate) fn seed(map: &TrackMap, points: &[[f32; 2]], parameters: &SearchParameters) -> Vec<Pose> {
     if points.is_empty() {

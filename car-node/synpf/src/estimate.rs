@@ -32,7 +32,7 @@ impl Estimate {
         }
     }
 
-    /// Standard deviations along and across the heading [m].
+    /// Standard deviations along and across the heading \[m\].
     pub(crate) fn along_and_across(&self) -> [f64; 2] {
         let turn = rotation(self.pose.heading);
         let own = turn.transpose() * self.covariance * turn;
@@ -40,7 +40,7 @@ impl Estimate {
     }
 }
 
-/// Turns the covariance of x, y and heading from a frame at `heading` [rad] into the frame around it.
+/// Turns the covariance of x, y and heading from a frame at `heading` \[rad\] into the frame around it.
 pub(crate) fn rotation(heading: f64) -> Matrix3<f64> {
     let (sin, cos) = heading.sin_cos();
     Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0)

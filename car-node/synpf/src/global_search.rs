@@ -46,12 +46,12 @@ pub(crate) struct Candidate {
     pub(crate) score: f64,
     /// Log of the prior odds, in the same units: what speaks for it beside the scans.
     pub(crate) prior: f64,
-    /// Scans that it was held against, and over how long [s].
+    /// Scans that it was held against, and over how long \[s\].
     scans: u32,
     seconds: f64,
 }
 
-/// How long one scan is remembered in a score [s].
+/// How long one scan is remembered in a score \[s\].
 const MEMORY: f64 = 0.5;
 
 /// Variance that a candidate's position gains with the way, along and across it [m^2 per m], and its heading with the turn
@@ -143,7 +143,7 @@ pub(crate) struct Search {
     /// Best first.
     pub(crate) candidates: Vec<Candidate>,
     driven: f64,
-    /// Time since the last global check joined [s].
+    /// Time since the last global check joined \[s\].
     since_check: f64,
     /// Fit below which no candidate is confirmed, and for how long the search goes on [s]: it is let go in time.
     least_fit: f64,
@@ -156,19 +156,19 @@ const CHECK_EVERY: [f64; 2] = [0.3, 1.0];
 /// A candidate worse than the best by this is dropped.
 const HOPELESS: f64 = 12.0;
 
-/// Candidates nearer than this are one [m], [rad].
+/// Candidates nearer than this are one \[m\], \[rad\].
 const SAME: [f64; 2] = [0.3, 0.2];
 
 /// Beams that a seed is fitted with: there are many seeds, and those that stay are fitted to every beam of the next scans.
 const FITTED_BEAMS: usize = 180;
 
-/// A candidate is confirmed after so many scans, and so long [s].
+/// A candidate is confirmed after so many scans, and so long \[s\].
 const CONFIRMED_AFTER: (u32, f64) = (3, 0.12);
 
-/// Time over which a search lets go of the fit that it asks for [s].
+/// Time over which a search lets go of the fit that it asks for \[s\].
 const LEAST_FIT_FOR: f64 = 5.0;
 
-/// Standard deviation of a candidate that motion has not confirmed [m], [m], [rad]: it may be another place.
+/// Standard deviation of a candidate that motion has not confirmed \[m\], \[m\], [rad]: it may be another place.
 const UNCONFIRMED: [f64; 3] = [1.0, 1.0, 0.5];
 
 impl Default for Search {
@@ -184,7 +184,7 @@ impl Default for Search {
 }
 
 impl Search {
-    /// A search that begins with candidates which were followed over so much driving [m], and that confirms none which fits
+    /// A search that begins with candidates which were followed over so much driving \[m\], and that confirms none which fits
     /// worse than `least_fit` at first.
     pub(crate) fn with(
         candidates: Vec<Candidate>,
@@ -356,12 +356,12 @@ impl Search {
     }
 }
 
-/// A jump of odometry by less than this is no other place [m].
+/// A jump of odometry by less than this is no other place \[m\].
 const NEARBY: f64 = 0.6;
 
 /// Odometry's share of error over a way of which nothing was seen...
 const ASTRAY: f64 = 0.05;
-/// ...and how far apart poses at its end are tried [m], [rad].
+/// ...and how far apart poses at its end are tried \[m\], \[rad\].
 const STEP: f64 = 0.2;
 const TURN: f64 = 0.06;
 

@@ -15,10 +15,10 @@ pub(crate) struct LikelihoodField {
     off_track: f32,
 }
 
-/// Step of the table [m].
+/// Step of the table \[m\].
 const FIELD_STEP: f32 = 0.01;
 
-/// All distances from here on are equally likely [m].
+/// All distances from here on are equally likely \[m\].
 const FIELD_LIMIT: f32 = 2.0;
 
 /// A particle inside a wall loses as much as by so many end points outside the map.
@@ -68,7 +68,7 @@ impl LikelihoodField {
         }
     }
 
-    /// The log-likelihood of an end point in grid coordinates [cells].
+    /// The log-likelihood of an end point in grid coordinates \[cells\].
     #[inline]
     fn at(&self, field: &DistanceField, u: f32, v: f32) -> f32 {
         field.nearest(u, v).map_or(self.off_track, |distance| {

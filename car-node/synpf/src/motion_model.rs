@@ -31,7 +31,7 @@ pub enum MotionModel {
 pub struct MotionParameters {
     /// Which model.
     pub motion_model: MotionModel,
-    /// The interval that the parameters of the four models refer to [s]: one message of odometry at 50 Hz.
+    /// The interval that the parameters of the four models refer to \[s\]: one message of odometry at 50 Hz.
     pub noise_interval: f64,
     /// `tum`: standard deviation of a rotation per rotation [rad/rad] (Stahl et al., IV 2019, as all of `tum`).
     pub alpha_1_tum: f64,
@@ -41,7 +41,7 @@ pub struct MotionParameters {
     pub alpha_3_tum: f64,
     /// `tum`: standard deviation of the translation per rotation [m/rad].
     pub alpha_4_tum: f64,
-    /// `tum`: least translation per interval that `alpha_2_tum` is divided by [m].
+    /// `tum`: least translation per interval that `alpha_2_tum` is divided by \[m\].
     pub lam_thresh: f64,
     /// `amcl`: variance of a rotation per squared rotation [rad^2/rad^2] (table 5.6, and AMCL's `alpha1`). The reference
     /// adds standard deviations instead of variances, so its values have to be squared; this goes for all four.
@@ -61,21 +61,21 @@ pub struct MotionParameters {
     pub motion_dispersion_arc_theta: f64,
     /// `arc`: standard deviation of the sideways motion per forward motion [m/m].
     pub motion_dispersion_arc_xy: f64,
-    /// `arc`: least standard deviation of the forward motion [m].
+    /// `arc`: least standard deviation of the forward motion \[m\].
     pub motion_dispersion_arc_x_min: f64,
-    /// `arc`: least standard deviation of the sideways motion [m].
+    /// `arc`: least standard deviation of the sideways motion \[m\].
     pub motion_dispersion_arc_y_min: f64,
-    /// `arc`: greatest standard deviation of the sideways motion [m].
+    /// `arc`: greatest standard deviation of the sideways motion \[m\].
     pub motion_dispersion_arc_y_max: f64,
-    /// `arc`: least standard deviation of the turn [rad].
+    /// `arc`: least standard deviation of the turn \[rad\].
     pub motion_dispersion_arc_theta_min: f64,
-    /// `arc`: forward motion per interval up to which `motion_dispersion_arc_xy` adds nothing [m].
+    /// `arc`: forward motion per interval up to which `motion_dispersion_arc_xy` adds nothing \[m\].
     pub motion_dispersion_arc_xy_min_x: f64,
-    /// `mit`: standard deviation of the forward motion [m] (all of `mit` as in MIT's particle filter).
+    /// `mit`: standard deviation of the forward motion \[m\] (all of `mit` as in MIT's particle filter).
     pub motion_dispersion_x: f64,
-    /// `mit`: standard deviation of the sideways motion [m].
+    /// `mit`: standard deviation of the sideways motion \[m\].
     pub motion_dispersion_y: f64,
-    /// `mit`: standard deviation of the turn [rad].
+    /// `mit`: standard deviation of the turn \[rad\].
     pub motion_dispersion_theta: f64,
     /// Noise on the position that every model adds [m/sqrt(s)], so that copies of a particle separate.
     pub diffusion_xy: f64,
@@ -180,14 +180,14 @@ impl MotionParameters {
 pub(crate) enum Motion {
     /// Turn by `rot1`, drive `trans` along the new heading, turn by `rot2`.
     Polar {
-        /// Means of rot1 [rad], trans [m], rot2 [rad].
+        /// Means of rot1 \[rad\], trans \[m\], rot2 \[rad\].
         mean: [f32; 3],
         /// Standard deviations of the same.
         sigma: [f32; 3],
     },
-    /// Move by x, y [m] in the car's frame, then turn.
+    /// Move by x, y \[m\] in the car's frame, then turn.
     Body {
-        /// Means of x [m], y [m], turn [rad].
+        /// Means of x \[m\], y \[m\], turn \[rad\].
         mean: [f32; 3],
         /// Standard deviations of the same.
         sigma: [f32; 3],
@@ -195,7 +195,7 @@ pub(crate) enum Motion {
 }
 
 impl Motion {
-    /// The motion `delta` of `base_link` over `dt` [s]. `widen` scales the noise of the model; 1 leaves it as tuned.
+    /// The motion `delta` of `base_link` over `dt` \[s\]. `widen` scales the noise of the model; 1 leaves it as tuned.
     pub(crate) fn new(delta: Pose, dt: f64, widen: f64, parameters: &MotionParameters) -> Self {
         // Each interval has its share of the motion, and the variances of the intervals add up.
         let intervals = (dt / parameters.noise_interval).max(1e-3);

@@ -34,24 +34,24 @@ pub(crate) struct OdometryTrack {
     discontinuity: Option<Pose>,
 }
 
-/// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.
+/// Longest that odometry is carried on beyond its last message \[s\]; a scan later than that is dropped.
 pub(crate) const CARRY: f64 = 0.25;
 
 /// As much as a late scan can need: 2 s at 200 Hz.
 const KEPT: usize = 400;
 
-/// A step is a jump if it differs by more than this from what the twist says [m], [rad]...
+/// A step is a jump if it differs by more than this from what the twist says \[m\], \[rad\]...
 const JUMP: [f64; 2] = [0.3, 0.3];
 /// ...plus this much per second, for a twist that is wrong [m/s], [rad/s].
 const JUMP_RATE: [f64; 2] = [3.0, 3.0];
 
-/// After a gap of so long [s] the pose says where the car has gone, and not the twist, if it can have gone so far.
+/// After a gap of so long \[s\] the pose says where the car has gone, and not the twist, if it can have gone so far.
 const GAP: f64 = 0.5;
 
 /// Wheels that turn faster than this do not creep [m/s].
 const SLOW: f64 = 0.3;
 
-/// A gyroscope is silent when its last reading is older than this [s].
+/// A gyroscope is silent when its last reading is older than this \[s\].
 const GYRO_SILENT: f64 = 0.1;
 
 /// Acceleration is taken over this long [s]: shorter is noise, longer is late.
@@ -313,7 +313,7 @@ impl OdometryTrack {
         }
     }
 
-    /// The turn from one stamp to another by the gyroscope [rad], held between readings; None if it was silent.
+    /// The turn from one stamp to another by the gyroscope \[rad\], held between readings; None if it was silent.
     fn turn_by_gyro(&self, from: Stamp, to: Stamp) -> Option<f64> {
         let first = self
             .yaw_rates
@@ -342,7 +342,7 @@ impl OdometryTrack {
     }
 
     /// The pose in the smooth frame at a stamp: interpolated on SE(2), carried on by the last twist for at most
-    /// `carry` [s] beyond the last message. None before the first message.
+    /// `carry` \[s\] beyond the last message. None before the first message.
     pub(crate) fn at(&self, stamp: Stamp, carry: f64) -> Option<(Pose, Twist)> {
         let after = self.points.partition_point(|point| point.stamp <= stamp);
         let Some(before) = after.checked_sub(1) else {
@@ -368,7 +368,7 @@ impl OdometryTrack {
     }
 }
 
-/// The motion of a constant twist over `dt` [s].
+/// The motion of a constant twist over `dt` \[s\].
 fn moved(twist: &Twist, dt: f64) -> Pose {
     Pose::exp([twist.linear_x * dt, twist.linear_y * dt, twist.angular * dt])
 }

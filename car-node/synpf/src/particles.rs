@@ -22,7 +22,7 @@ pub struct ParticleParameters {
     pub max_particles: usize,
     /// Lower bound of the number of particles; equal to `max_particles`, the number is fixed.
     pub min_particles: usize,
-    /// KLD-sampling: allowed Kullback-Leibler divergence between the sampled and the true posterior [nat] (epsilon in Fox,
+    /// KLD-sampling: allowed Kullback-Leibler divergence between the sampled and the true posterior \[nat\] (epsilon in Fox,
     /// IJRR 2003; `kld_err` in AMCL).
     pub kld_error: f64,
     /// KLD-sampling: quantile of the standard normal for the probability that the divergence stays below `kld_error`; 2.33
@@ -31,11 +31,11 @@ pub struct ParticleParameters {
     /// Resample when the effective sample size is at most this share of the number of particles, in [0, 1]; 1 resamples at
     /// every scan, 0 never.
     pub resample_ess_ratio: f64,
-    /// Standard deviation of a given initial pose along x [m].
+    /// Standard deviation of a given initial pose along x \[m\].
     pub initial_std_x: f64,
-    /// Standard deviation of a given initial pose along y [m].
+    /// Standard deviation of a given initial pose along y \[m\].
     pub initial_std_y: f64,
-    /// Standard deviation of a given initial heading [rad].
+    /// Standard deviation of a given initial heading \[rad\].
     pub initial_std_heading: f64,
 }
 
@@ -111,7 +111,7 @@ impl Particles {
         self.poses.len()
     }
 
-    /// Draws `count` particles around a pose, with the given standard deviations of x, y [m] and heading [rad].
+    /// Draws `count` particles around a pose, with the given standard deviations of x, y \[m\] and heading \[rad\].
     pub(crate) fn scatter(&mut self, count: usize, pose: Pose, sigma: [f64; 3]) {
         self.poses.resize(count);
         for i in 0..count {

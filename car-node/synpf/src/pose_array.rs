@@ -84,17 +84,17 @@ impl PoseArray {
         store(sin, &mut self.sin[i..], lanes);
     }
 
-    /// x [m].
+    /// x \[m\].
     pub(crate) fn x(&self) -> &[f32] {
         &self.x
     }
 
-    /// y [m].
+    /// y \[m\].
     pub(crate) fn y(&self) -> &[f32] {
         &self.y
     }
 
-    /// Headings in [-pi, pi) to the rounding of `f32` [rad].
+    /// Headings in [-pi, pi) to the rounding of `f32` \[rad\].
     pub(crate) fn heading(&self) -> &[f32] {
         &self.heading
     }

@@ -11,16 +11,16 @@ use crate::{Dropped, Scan};
 /// One beam at the scan's stamp.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Beam {
-    /// Direction in the laser's frame at the scan's stamp [rad].
+    /// Direction in the laser's frame at the scan's stamp \[rad\].
     pub(crate) angle: f32,
-    /// Range from there [m]; infinite for no return.
+    /// Range from there \[m\]; infinite for no return.
     pub(crate) range: f32,
 }
 
 /// A scan as the filter uses it. Buffers are kept from scan to scan.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PreprocessedScan {
-    /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp [m], in order.
+    /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp \[m\], in order.
     pub(crate) points: Vec<[f32; 2]>,
     /// Mount of the laser, from where the beams start.
     pub(crate) base_link_from_laser: Pose,
@@ -46,7 +46,7 @@ const MOST_BEAMS: usize = 14_400;
 /// The sweep is deskewed in this many segments. Within a segment the motion counts as uniform.
 const SEGMENTS: usize = 8;
 
-/// Odometry is carried on beyond its last message by the length of the sweep and this [s].
+/// Odometry is carried on beyond its last message by the length of the sweep and this \[s\].
 const CARRIED: f64 = 0.1;
 
 /// Marks a beam without a return.

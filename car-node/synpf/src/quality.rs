@@ -11,7 +11,7 @@ use crate::track_map::TrackMap;
 pub(crate) struct Quality {
     /// Share of valid beams that end within 0.10 m of a wall.
     pub(crate) alignment: f64,
-    /// Mean of min(distance to the nearest wall, 1 m) [m].
+    /// Mean of min(distance to the nearest wall, 1 m) \[m\].
     pub(crate) residual: f64,
     /// Share of beams more than 0.3 m shorter than the map says.
     pub(crate) short: f64,
@@ -25,10 +25,10 @@ const BEAMS: usize = 60;
 /// Beams whose range is compared with the map's, which costs more.
 const CAST: usize = 20;
 
-/// Nearer than this to a wall an end point is on it [m].
+/// Nearer than this to a wall an end point is on it \[m\].
 const ALIGNED: f32 = 0.10;
 
-/// A range this far from the map's is another thing [m].
+/// A range this far from the map's is another thing \[m\].
 const OTHER: f32 = 0.3;
 
 impl Quality {
@@ -49,7 +49,7 @@ impl Quality {
         Self::of_points(map, &scan.points, scan.base_link_from_laser, pose)
     }
 
-    /// The same for end points in the frame of `base_link` [m].
+    /// The same for end points in the frame of `base_link` \[m\].
     pub(crate) fn of_points(
         map: &TrackMap,
         points: &[[f32; 2]],

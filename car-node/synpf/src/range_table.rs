@@ -9,7 +9,7 @@ use crate::cddt::{CddtSlice, DIRECTIONS, HALF_TURN};
 /// Directions that one task fills while the table is built.
 const SEGMENT: usize = 16;
 
-/// One unit of a stored range [m]; 16 bits reach 164 m.
+/// One unit of a stored range \[m\]; 16 bits reach 164 m.
 pub(crate) const UNIT: f32 = 0.0025;
 
 /// What a table's contents depend on, beside the map.
@@ -99,17 +99,17 @@ impl RangeTable {
         }
     }
 
-    /// Memory that it takes [bytes].
+    /// Memory that it takes \[bytes\].
     pub(crate) fn bytes(&self) -> usize {
         size_of_val(&*self.ranges) + size_of_val(&*self.row_of)
     }
 
-    /// Memory that a table for `region_cells` cells of a grid of `grid_cells` takes [bytes].
+    /// Memory that a table for `region_cells` cells of a grid of `grid_cells` takes \[bytes\].
     pub(crate) fn bytes_for(grid_cells: usize, region_cells: usize) -> usize {
         region_cells * DIRECTIONS * size_of::<u16>() + (grid_cells + 1) * size_of::<u32>()
     }
 
-    /// The rows for eight points in grid coordinates [cells]; see [`RangeTable::row`].
+    /// The rows for eight points in grid coordinates \[cells\]; see [`RangeTable::row`].
     #[inline]
     pub(crate) fn rows_at(&self, u: f32x8, v: f32x8) -> [u32; 8] {
         let zero = f32x8::ZERO;
@@ -138,7 +138,7 @@ impl RangeTable {
         self.ranges.get(start..start + DIRECTIONS)?.try_into().ok()
     }
 
-    /// Range from a point [cells] for a particle's heading and a beam's direction [m], rounded as the beam model does it.
+    /// Range from a point \[cells\] for a particle's heading and a beam's direction \[m\], rounded as the beam model does it.
     #[cfg(test)]
     pub(crate) fn range(&self, from: [f32; 2], heading: f32, beam: f32) -> Option<f32> {
         let row = self.row(self.rows_at(f32x8::splat(from[0]), f32x8::splat(from[1]))[0])?;

@@ -5,7 +5,7 @@
 //! grazes a wall any error across it becomes as large as one likes along it. For each method: a range ends within the
 //! bound of a face, and the ray up to there is nowhere deeper behind a face than the bound.
 //!
-//! | method | bound [cells] | because |
+//! | method | bound \[cells\] | because |
 //! |---|---|---|
 //! | CDDT, along one of its 256 directions | 1/4; before the end of a wall seen along up to 2 | lanes are half a cell wide, and a face is extended through the lane |
 //! | CDDT, any direction | that, and r * pi / 256 at a range r | half a step between directions |
@@ -45,7 +45,7 @@ mod tests {
     use crate::cddt::DIRECTIONS;
     use crate::range_table::{TableParameters, UNIT};
 
-    /// Cells along each side of a random map, and the size of a cell [m].
+    /// Cells along each side of a random map, and the size of a cell \[m\].
     const SIDE: usize = 80;
     const RESOLUTION: f64 = 0.05;
     const LONGEST: f32 = 1000.0;
@@ -80,7 +80,7 @@ mod tests {
             Self { grid, field, faces }
         }
 
-        /// A point in free space [cells].
+        /// A point in free space \[cells\].
         fn free_point(&self, random: &mut SmallRng) -> [f32; 2] {
             loop {
                 let point = [0, 0].map(|_: i32| random.random_range(3.0..SIDE as f32 - 3.0));
@@ -96,7 +96,7 @@ mod tests {
             }
         }
 
-        /// Distance of a point from the nearest face [cells].
+        /// Distance of a point from the nearest face \[cells\].
         fn to_face(&self, point: [f32; 2]) -> f32 {
             let squared = |[a, b]: &[[f32; 2]; 2]| {
                 let along = [b[0] - a[0], b[1] - a[1]];
@@ -109,7 +109,7 @@ mod tests {
             self.faces.iter().map(squared).fold(f32::MAX, f32::min).sqrt()
         }
 
-        /// Where a ray crosses faces, by brute force [cells].
+        /// Where a ray crosses faces, by brute force \[cells\].
         fn crossings(&self, from: [f32; 2], angle: f32) -> Vec<f32> {
             let (sin, cos) = angle.sin_cos();
             let turned = |p: [f32; 2]| {
@@ -158,7 +158,7 @@ mod tests {
     }
 
     /// Runs `measure` on random rays of random maps, with what `build` makes of each map. It returns the angle that the
-    /// range is for [rad], the range [cells], and the bounds of how early and how deep it may be [cells]. Returns the errors
+    /// range is for \[rad\], the range \[cells\], and the bounds of how early and how deep it may be \[cells\]. Returns the errors
     /// of all rays.
     fn hold<T>(
         seed: u64,
@@ -189,10 +189,10 @@ mod tests {
         errors
     }
 
-    /// What f32 does to places on a map of this size [cells].
+    /// What f32 does to places on a map of this size \[cells\].
     const ROUNDING: f32 = 1e-3;
 
-    /// The bounds of a CDDT along its directions: early, deep [cells].
+    /// The bounds of a CDDT along its directions: early, deep \[cells\].
     const CDDT: [f32; 2] = [2.02 + ROUNDING, 0.25 + ROUNDING];
 
     #[test]

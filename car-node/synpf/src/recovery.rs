@@ -39,9 +39,9 @@ use crate::validation::Check;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RecoveryParameters {
-    /// Time over which the fit of the scans is averaged for the long term [s].
+    /// Time over which the fit of the scans is averaged for the long term \[s\].
     pub fit_time_slow: f64,
-    /// Time over which it is averaged for the short term [s].
+    /// Time over which it is averaged for the short term \[s\].
     pub fit_time_fast: f64,
     /// Inject particles along the track when the short-term average falls below the long-term one.
     pub injection: bool,
@@ -57,7 +57,7 @@ pub struct RecoveryParameters {
     pub lost_alignment: f64,
     /// ...beside this share of beams that are longer than the map says.
     pub lost_long_beams: f64,
-    /// How long both must hold until it is given up, rival or not [s].
+    /// How long both must hold until it is given up, rival or not \[s\].
     pub lost_after: f64,
     /// Log odds that the history of a pose gives it at most, against all other places.
     pub trust_limit: f64,
@@ -66,7 +66,7 @@ pub struct RecoveryParameters {
     pub piece_odds: f64,
     /// Log odds at which another place is believed.
     pub switch_odds: f64,
-    /// Distance that the car must have driven before that [m]; half of it where the scans say that the car was carried.
+    /// Distance that the car must have driven before that \[m\]; half of it where the scans say that the car was carried.
     pub switch_distance: f64,
 }
 
@@ -129,9 +129,9 @@ pub(crate) struct Evidence<'a> {
     pub(crate) motion: Pose,
     /// Where the car would be if odometry's discontinuity since the scan before was a motion of the car; None without one.
     pub(crate) displaced: Option<Pose>,
-    /// Time since the scan before [s].
+    /// Time since the scan before \[s\].
     pub(crate) seconds: f64,
-    /// How far end points scatter about the walls [m].
+    /// How far end points scatter about the walls \[m\].
     pub(crate) scatter: f64,
 }
 
@@ -190,18 +190,18 @@ pub(crate) struct Recovery {
     search: Option<Search>,
     check: CheckState,
     checks: u64,
-    /// Time until the map may be looked at again [s], and how long to wait the next time.
+    /// Time until the map may be looked at again \[s\], and how long to wait the next time.
     patience: [f64; 2],
     /// Averages of the fit, over the long and the short term.
     averages: Option<[f64; 2]>,
     /// The estimate at the scan before.
     before: Option<Pose>,
     doubt: Option<InDoubt>,
-    /// Time since the pose was set or found [s].
+    /// Time since the pose was set or found \[s\].
     followed: f64,
 }
 
-/// A pose that was set or found is not doubted for so long: the particles are still contracting [s].
+/// A pose that was set or found is not doubted for so long: the particles are still contracting \[s\].
 const SETTLING: f64 = 0.25;
 
 /// Alignment of a localized car on a map of usual quality: what the averages start from, so that a pose that was
@@ -212,22 +212,22 @@ const USUAL: f64 = 0.8;
 const FITS_WELL: f64 = 0.85;
 
 /// A look at the map takes as long as many updates: after each that changed nothing the next comes twice as late, from the
-/// first of these to the second [s].
+/// first of these to the second \[s\].
 const PATIENCE: [f64; 2] = [0.1, 4.0];
 
 /// A rival that leads by so many pieces of wall explains the scans as well.
 const LEADING: f64 = 3.0;
 
-/// A correction larger than this is another place [m].
+/// A correction larger than this is another place \[m\].
 const LEAP: f64 = 0.5;
 
 /// Share of the usual fit that another place must have.
 const AS_USUAL: f64 = 0.75;
 
-/// A lead this many times as large as is needed is believed of a car that stands, after so long [s].
+/// A lead this many times as large as is needed is believed of a car that stands, after so long \[s\].
 const STANDING: (f64, f64) = (2.0, 0.3);
 
-/// A correction of the prediction larger than this is no motion of the car [m].
+/// A correction of the prediction larger than this is no motion of the car \[m\].
 const PLAUSIBLE: f64 = 0.3;
 
 impl Recovery {
@@ -588,7 +588,7 @@ impl InDoubt {
     }
 }
 
-/// How far from a wall an end point of it may lie: three times its scatter, and the grain of the map [m].
+/// How far from a wall an end point of it may lie: three times its scatter, and the grain of the map \[m\].
 fn reach(map: &TrackMap, scatter: f64) -> f32 {
     (3.0 * scatter).max(1.5 * map.grid().resolution).clamp(0.1, 0.5) as f32
 }

@@ -11,7 +11,7 @@ use crate::particles::{ParticleParameters, Particles};
 pub(crate) struct Proposal {
     /// Its mean, in the grid's frame.
     pub(crate) mean: Pose,
-    /// Lower triangular root of its covariance of x, y [m] and heading [rad].
+    /// Lower triangular root of its covariance of x, y \[m\] and heading \[rad\].
     pub(crate) root: Matrix3<f64>,
     /// Share of the particles that are drawn from it, in [0, 1].
     pub(crate) share: f64,

@@ -23,10 +23,10 @@ pub struct RefinementParameters {
     pub refine_beams: usize,
     /// Most Gauss-Newton steps.
     pub refine_iterations: usize,
-    /// Standard deviation of an end point's distance to its wall [m]: laser, and the grain of a map of 5 cm cells. Where they
+    /// Standard deviation of an end point's distance to its wall \[m\]: laser, and the grain of a map of 5 cm cells. Where they
     /// are seen to scatter by more, that counts.
     pub refine_sigma: f64,
-    /// Distance from a wall at which an end point counts a quarter [m]; farther ones are opponents. At 0.1 an opponent
+    /// Distance from a wall at which an end point counts a quarter \[m\]; farther ones are opponents. At 0.1 an opponent
     /// that blocks the view for seconds pulls the pose half a metre off; on maps that fit badly that reach does better.
     pub refine_reach: f64,
     /// How many neighbouring end points err together, and so count as one.
@@ -34,7 +34,7 @@ pub struct RefinementParameters {
     /// Share of the particles that are drawn around the refined estimate when resampling.
     pub refine_feedback: f64,
     /// How fast the offset of the map's walls is learned, and the end points' scatter about them: the distance driven until
-    /// 63 % of it are known [m]; 0 takes the walls to stand where the map says, and end points to scatter by `refine_sigma`.
+    /// 63 % of it are known \[m\]; 0 takes the walls to stand where the map says, and end points to scatter by `refine_sigma`.
     pub wall_offset_distance: f64,
 }
 
@@ -223,7 +223,7 @@ pub(crate) fn fit(field: &DistanceField, points: &[[f32; 2]], most: usize, pose:
     fit_by(field, points, most, pose, reach, |weight, _| weight)
 }
 
-/// The same with a say in the weights, which are given with where the beams end, in the grid's frame [m].
+/// The same with a say in the weights, which are given with where the beams end, in the grid's frame \[m\].
 pub(crate) fn fit_by(
     field: &DistanceField,
     points: &[[f32; 2]],

@@ -18,11 +18,11 @@ pub(crate) struct Level {
     width: usize,
     /// 255 on a wall, a half at a distance as far off as a pose of this level is, falling to 0.
     nearness: Vec<u8>,
-    /// Edge of a cell [m].
+    /// Edge of a cell \[m\].
     resolution: f32,
 }
 
-/// A level's cells are about this large [m], fine and coarse, and it is blurred twice as far.
+/// A level's cells are about this large \[m\], fine and coarse, and it is blurred twice as far.
 const CELL: [f64; 2] = [0.1, 0.2];
 
 /// Least mean nearness of a pose that is looked at again.
@@ -92,7 +92,7 @@ impl Level {
             .collect()
     }
 
-    /// The summed nearness of points around a position [m]; None if it is too little. Most poses are hopeless after half
+    /// The summed nearness of points around a position \[m\]; None if it is too little. Most poses are hopeless after half
     /// of the points.
     #[inline]
     pub(crate) fn matched(&self, position: [f32; 2], points: &[[f32; 2]]) -> Option<u32> {

@@ -8,15 +8,15 @@ use crate::validation::Check;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct SearchParameters {
-    /// Distance between the positions that are tried [m].
+    /// Distance between the positions that are tried \[m\].
     pub search_step: f64,
-    /// Angle between the headings that are tried [rad].
+    /// Angle between the headings that are tried \[rad\].
     pub search_turn: f64,
     /// Candidates that are followed.
     pub search_candidates: usize,
     /// By how much the best must explain a scan better than the next, in units of log-likelihood.
     pub search_margin: f64,
-    /// Distance that the car must have driven before one is confirmed [m].
+    /// Distance that the car must have driven before one is confirmed \[m\].
     pub search_distance: f64,
 }
 

@@ -44,15 +44,15 @@ use self::wheel_scale::WheelScale;
 /// What the sensors have said since the start, summed up, without corrections.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct DrivenSums {
-    /// Distance by the wheels, backwards negative [m].
+    /// Distance by the wheels, backwards negative \[m\].
     pub(crate) distance: f64,
-    /// Turn by odometry [rad].
+    /// Turn by odometry \[rad\].
     pub(crate) turn: f64,
     /// Turn by the gyroscope, while it spoke, in its own unit.
     pub(crate) gyro_turn: f64,
-    /// For how long it spoke [s].
+    /// For how long it spoke \[s\].
     pub(crate) gyro_time: f64,
-    /// For how long the wheels slid [s].
+    /// For how long the wheels slid \[s\].
     pub(crate) sliding: f64,
 }
 
@@ -118,7 +118,7 @@ struct FittedPose {
 #[derive(Debug, Clone, Copy)]
 struct Stretch {
     seconds: f64,
-    /// By the scans: distance along the arc [m], turn [rad].
+    /// By the scans: distance along the arc \[m\], turn \[rad\].
     distance: f64,
     turn: f64,
     /// See [`FittedPose::information`].
@@ -129,7 +129,7 @@ struct Stretch {
 /// Stretches are at least so long [s]: in less, the heading by the scans is too coarse for a yaw rate.
 const STRETCH: f64 = 0.1;
 
-/// Longer ones, over a gap between scans, are no reference [s].
+/// Longer ones, over a gap between scans, are no reference \[s\].
 const LONGEST_STRETCH: f64 = 0.5;
 
 /// Fitted poses that are kept: enough for the longest lag and a stretch at 400 scans a second.

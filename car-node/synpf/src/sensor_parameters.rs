@@ -45,14 +45,14 @@ pub struct SensorParameters {
     pub z_max: f64,
     /// Weight of a beam of any range, in (0, 1] (table 6.1).
     pub z_rand: f64,
-    /// Standard deviation of a hit [m] (table 6.1): noise of the laser, and the grain of the map and of the range table.
+    /// Standard deviation of a hit \[m\] (table 6.1): noise of the laser, and the grain of the map and of the range table.
     pub sigma_hit: f64,
     /// Rate at which the density of short readings decays with range [1/m] (table 6.1).
     pub lambda_short: f64,
     /// The likelihood of the scan is taken to the power 1 / `squash_factor`, because the errors of neighbouring beams are
     /// correlated (Walsh and Karaman, ICRA 2018; 2.2 in the reference's file).
     pub squash_factor: f64,
-    /// Ranges from here on count as no return [m].
+    /// Ranges from here on count as no return \[m\].
     pub max_range: f64,
     /// Number of directions over a full turn in the range table, at most 256 (`theta_discretization` in the reference's file).
     pub theta_discretization: u16,

@@ -58,9 +58,9 @@ pub struct SynPf {
 #[derive(Debug, Clone, Copy)]
 struct Step {
     stamp: Stamp,
-    /// Time since the estimate [s].
+    /// Time since the estimate \[s\].
     seconds: f64,
-    /// Time from the first beam to the last [s].
+    /// Time from the first beam to the last \[s\].
     sweep: f64,
     /// Calibrated odometry's pose at the stamp.
     odom: Pose,
@@ -73,19 +73,19 @@ struct Step {
     odometry_jump: Option<[f64; 2]>,
 }
 
-/// A scan that is older than the pose that was set by more than this is dropped [s].
+/// A scan that is older than the pose that was set by more than this is dropped \[s\].
 const LATE: f64 = 0.5;
 
-/// A pause between scans after which the motion is uncertain beyond its tuning [s].
+/// A pause between scans after which the motion is uncertain beyond its tuning \[s\].
 const PAUSE: f64 = 0.5;
 
 /// By how much the noise is wider after such a pause.
 const AFTER_PAUSE: f64 = 2.0;
 
-/// Slip is taken to go on as it was for so long after a scan [s].
+/// Slip is taken to go on as it was for so long after a scan \[s\].
 const AHEAD: f64 = 0.1;
 
-/// Least standard deviations of the particles around a pose that a search has found [m], [m], [rad].
+/// Least standard deviations of the particles around a pose that a search has found \[m\], \[m\], \[rad\].
 const FOUND_SPREAD: [f64; 3] = [0.1, 0.1, 0.05];
 
 impl SynPf {

@@ -41,7 +41,7 @@ pub(crate) enum Table {
 }
 
 impl Table {
-    /// Memory that it takes [bytes].
+    /// Memory that it takes \[bytes\].
     fn bytes(&self) -> usize {
         match self {
             Self::Ranges(table) => table.bytes(),
@@ -104,7 +104,7 @@ impl TableStore {
         self.state().pending.clone()
     }
 
-    /// Memory that all tables take [bytes].
+    /// Memory that all tables take \[bytes\].
     pub(crate) fn bytes(&self) -> usize {
         self.state().built.values().map(Table::bytes).sum()
     }

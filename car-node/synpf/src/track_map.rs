@@ -30,7 +30,7 @@ pub struct TrackMap {
     reference_tables: RangeTables,
 }
 
-/// A track is nowhere wider than twice this; what is wider lies beside it [m].
+/// A track is nowhere wider than twice this; what is wider lies beside it \[m\].
 const TRACK_CLEARANCE: f64 = 5.0;
 
 impl TrackMap {
@@ -74,13 +74,13 @@ impl TrackMap {
         &self.field
     }
 
-    /// Signed distance from a point of `map` to the nearest wall's face [m]; positive in free space, 0 outside
+    /// Signed distance from a point of `map` to the nearest wall's face \[m\]; positive in free space, 0 outside
     /// the map.
     pub fn distance(&self, point: [f64; 2]) -> f64 {
         self.field.distance(point)
     }
 
-    /// Range that a laser at `map_from_laser` measures along its x axis [m], at most `max_range`; to the wall's
+    /// Range that a laser at `map_from_laser` measures along its x axis \[m\], at most `max_range`; to the wall's
     /// face in the distance field.
     pub fn range(&self, map_from_laser: Pose, max_range: f64) -> f64 {
         let laser = self.grid_from_map * map_from_laser;
@@ -118,12 +118,12 @@ impl TrackMap {
         &self.reference_tables
     }
 
-    /// Memory that the tables take [bytes].
+    /// Memory that the tables take \[bytes\].
     pub fn table_bytes(&self) -> usize {
         self.tables.bytes() + self.reference_tables.bytes()
     }
 
-    /// Memory that a table takes [bytes], known before it is built: exact for range tables, an upper bound for the CDDT.
+    /// Memory that a table takes \[bytes\], known before it is built: exact for range tables, an upper bound for the CDDT.
     pub(crate) fn bytes_for(&self, key: TableKey) -> usize {
         match key {
             TableKey::Ranges { region, .. } => {
@@ -180,7 +180,7 @@ impl TrackMap {
     }
 
     /// Whether a beam from a laser ends where nothing was mapped, without having met a wall on its way: through an open door,
-    /// or past where mapping stopped. Such a beam says nothing on where the laser is. Points in the grid's frame [m].
+    /// or past where mapping stopped. Such a beam says nothing on where the laser is. Points in the grid's frame \[m\].
     pub(crate) fn unmapped(&self, laser: [f32; 2], end: [f32; 2]) -> bool {
         let cells = 1.0 / self.grid.resolution as f32;
         let cell = end.map(|v| (v * cells).floor() as i64);

@@ -52,13 +52,13 @@ const NOISE_INTERVAL: f64 = 0.025;
 /// For so long odometry errs by the same share [s]: a bend, a braking. Beyond, errors are as good as independent.
 const LASTING: f64 = 0.5;
 
-/// Shorter intervals between scans count as this [s].
+/// Shorter intervals between scans count as this \[s\].
 const SHORTEST: f64 = 1e-3;
 
 /// How far the speed of wheels that spin or lock may be off, as a share of it.
 const SPINNING_SPEED_ERROR: f64 = 0.6;
 
-/// Reach at which predictions are compared by their fit [m].
+/// Reach at which predictions are compared by their fit \[m\].
 const FIT_REACH: f32 = 0.15;
 
 /// By how much the particles' mean must fit better than the estimate's own prediction to be preferred.

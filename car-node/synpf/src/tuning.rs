@@ -76,7 +76,7 @@ impl TrackMap {
         }
     }
 
-    /// Memory that [`TrackMap::prepare`] needs with the same arguments [bytes], known before anything is built: exact for
+    /// Memory that [`TrackMap::prepare`] needs with the same arguments \[bytes\], known before anything is built: exact for
     /// range tables, an upper bound for the CDDT, 0 for ray marching.
     pub fn table_bytes_for(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) -> usize {
         let keys = self.needed_tables(map_from_base_link, parameters);

@@ -20,7 +20,7 @@ fn named(name: &str) -> Parameters {
     Parameters::named(name).expect("ships")
 }
 
-/// Drives from `from` to `to` [s] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
+/// Drives from `from` to `to` \[s\] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
 fn drive(localizer: &mut SynPf, map: &TrackMap, from: f64, to: f64, scale: f64) -> Vec<Update> {
     let (mut odom, mut next, mut updates) = (from, from, Vec::new());
     while next < to {

@@ -34,7 +34,7 @@ fn localizer(map: &Arc<TrackMap>, name: &str) -> SynPf {
     SynPf::new(Arc::clone(map), BASE_LINK_FROM_LASER, parameters, 3).expect("sound")
 }
 
-/// Follows the car from one time to the next [s], with the sensors of [`common`]; calls back after each scan.
+/// Follows the car from one time to the next \[s\], with the sensors of [`common`]; calls back after each scan.
 fn drive(
     localizer: &mut dyn Localizer,
     map: &TrackMap,

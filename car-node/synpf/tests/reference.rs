@@ -34,7 +34,7 @@ fn placed(map: &Arc<TrackMap>, parameters: ReferenceParameters, seed: u64) -> Re
     localizer
 }
 
-/// Drives from `from` to `to` [s] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
+/// Drives from `from` to `to` \[s\] with odometry at 50 Hz and scans at 40 Hz; the updates in order.
 fn drive(localizer: &mut dyn Localizer, map: &TrackMap, from: f64, to: f64) -> Vec<Update> {
     let (mut odom, mut next, mut updates) = (from, from, Vec::new());
     while next < to {

@@ -6,7 +6,7 @@ use common::{BASE_LINK_FROM_LASER, lap, odometry, ring, scan, stamp, truth};
 use maps::Pose;
 use synpf::{Dropped, Odometry, Parameters, Scan, SensorFinding, SynPf, Twist, Update, YawRate};
 
-/// What happens to a message at a time [s].
+/// What happens to a message at a time \[s\].
 type Change<T> = Box<dyn Fn(f64, &mut T)>;
 
 /// The changes that a test makes to what the sensors say; times are seconds of the drive.
@@ -71,7 +71,7 @@ fn updates(outcomes: &[Outcome]) -> impl Iterator<Item = (f64, &Update)> {
         .filter_map(|(t, result)| Some((*t, result.as_ref().ok()?)))
 }
 
-/// Largest distance from the truth after two seconds [m].
+/// Largest distance from the truth after two seconds \[m\].
 fn worst(outcomes: &[Outcome]) -> f64 {
     updates(outcomes)
         .filter(|(t, _)| *t > 2.0)

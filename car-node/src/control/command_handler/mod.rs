@@ -268,7 +268,7 @@ impl CommandHandler {
     }
 }
 
-/// Longest fault [bytes]. One fault for every value of a set then fits into an event.
+/// Longest fault \[bytes\]. One fault for every value of a set then fits into an event.
 const LONGEST_FAULT: usize = 200;
 
 fn shorten(fault: &mut String) {

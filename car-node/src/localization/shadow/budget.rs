@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use synpf::Stamp;
 
-/// The CPU is judged over this long [s].
+/// The CPU is judged over this long \[s\].
 const WINDOW: f64 = 2.0;
 /// The filter is behind when more messages than this wait for it: about 0.1 s of a car's sensors.
 const BEHIND: usize = 10;
@@ -18,7 +18,7 @@ const TOO_MANY: f64 = 0.2;
 pub(super) struct ScanCost {
     /// The scan's stamp.
     pub(super) stamp: Stamp,
-    /// Time of the update in force [s].
+    /// Time of the update in force \[s\].
     pub(super) taken: f64,
     /// Messages that waited for the filter.
     pub(super) queued: usize,

@@ -9,7 +9,7 @@ use synpf::{Stamp, Update};
 use crate::telemetry::counters::Spread;
 use crate::wire;
 
-/// The last seconds are compared, about a lap of a small track [s].
+/// The last seconds are compared, about a lap of a small track \[s\].
 const LENGTH: f64 = 10.0;
 
 /// What one set made of a scan.
@@ -21,7 +21,7 @@ pub(super) struct ScanOutcome {
     residual: f64,
     innovation: f64,
     spread: [f64; 2],
-    /// Time taken [s].
+    /// Time taken \[s\].
     taken: f64,
 }
 

@@ -49,7 +49,7 @@ pub enum ShadowCommand {
 
 /// The comparison is published this often.
 const PERIOD: Duration = Duration::from_secs(1);
-/// A localizer that has just got its pose is not compared yet [s].
+/// A localizer that has just got its pose is not compared yet \[s\].
 const SETTLING: f64 = 2.0;
 
 /// Starts the thread. It ends when `commands` has no sender left.

@@ -14,7 +14,7 @@ use crate::sensors::frames::{Frames, Mount};
 
 /// Discovery goes on this long after the first scan and the first odometry, for other topics and `/tf_static`.
 const LOOK_AROUND: Duration = Duration::from_secs(1);
-/// Stamps further than this from this machine's time belong to another clock, as with `use_sim_time` [s].
+/// Stamps further than this from this machine's time belong to another clock, as with `use_sim_time` \[s\].
 const OTHER_CLOCK: f64 = 1.0;
 
 /// The topics of a car.
@@ -27,7 +27,7 @@ pub(super) struct CarTopics {
     pub(super) odometry_hash: Option<String>,
     pub(super) imu: Option<String>,
     pub(super) frames: Frames,
-    /// Sensor time minus wall time [s].
+    /// Sensor time minus wall time \[s\].
     pub(super) offset: f64,
 }
 

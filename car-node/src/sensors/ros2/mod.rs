@@ -111,7 +111,7 @@ pub struct Ros2 {
     mount: Mount,
     /// The mount is a guess, since `/tf_static` is missing.
     guessed: bool,
-    /// Sensor time minus wall time [s].
+    /// Sensor time minus wall time \[s\].
     offset: f64,
     clock: SensorClock,
     /// Messages that do not decode, by topic.

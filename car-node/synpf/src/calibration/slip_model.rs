@@ -29,7 +29,7 @@ pub(crate) struct SlipModel {
     covariance: Matrix3<f64>,
     /// Covariance of these three (rows) with the pose (columns).
     with_pose: Matrix3<f64>,
-    /// Time since the wheels last spun or locked [s].
+    /// Time since the wheels last spun or locked \[s\].
     gripping: f64,
 }
 
@@ -39,7 +39,7 @@ const UNKNOWN: [f64; 3] = [0.03, 0.006, 0.008];
 const CHANGE: [f64; 3] = [0.003, 0.001, 0.0005];
 /// Wheels that gain or lose more than this [m/s^2] spin or lock: no tyre drives a car so...
 const SPINNING: f64 = 8.0;
-/// ...and go on to for a while [s].
+/// ...and go on to for a while \[s\].
 const SPUN: f64 = 0.5;
 /// A correction of more than this many standard deviations is no slip of tyres within their limit: wheels that spin or
 /// lock, a collision, a marshal.
@@ -65,7 +65,7 @@ impl SlipModel {
         (self.mean[0] + self.mean[1] * drive.acceleration).clamp(-0.3, 0.3)
     }
 
-    /// The motion of a car whose wheels and gyroscope say `[x, y, turn]` ([m], [m], [rad] along an arc).
+    /// The motion of a car whose wheels and gyroscope say `[x, y, turn]` (\[m\], \[m\], \[rad\] along an arc).
     pub(crate) fn corrected(&self, [x, y, turn]: [f64; 3], drive: Drive) -> [f64; 3] {
         // Driving force makes the wheels turn too far forwards, whichever way the car goes.
         let lost = self.mean[0] * x + self.mean[1] * drive.acceleration * x.abs();
@@ -84,7 +84,7 @@ impl SlipModel {
         self.with_pose = Matrix3::zeros();
     }
 
-    /// The estimate was moved on from `from` to `predicted` by a motion of `distance` [m], which the slip was taken out of:
+    /// The estimate was moved on from `from` to `predicted` by a motion of `distance` \[m\], which the slip was taken out of:
     /// adds what is unknown of the slip to the pose's covariance.
     pub(crate) fn advance(
         &mut self,

@@ -15,12 +15,12 @@ pub(crate) struct SlipWindow {
 struct Step {
     stamp: Stamp,
     seconds: f64,
-    /// By the wheels as they turned [m].
+    /// By the wheels as they turned \[m\].
     wheel_distance: f64,
-    /// The same, less the slip that was expected [m], and the turn [rad].
+    /// The same, less the slip that was expected \[m\], and the turn \[rad\].
     odometry: [f64; 2],
     posterior: [f64; 2],
-    /// Motion to the left by the posterior less that by odometry [m].
+    /// Motion to the left by the posterior less that by odometry \[m\].
     aside: f64,
     /// By how much odometry was off, corrected as the steps before had taught: forwards and to the left [m/s], turning
     /// [rad/s].
@@ -63,10 +63,10 @@ impl Slip {
     }
 }
 
-/// Length of the window [s].
+/// Length of the window \[s\].
 const WINDOW: f64 = 0.3;
 
-/// Yaw rate and sideslip change within tenths of a second: what corrects a sweep must be as fresh as this [s].
+/// Yaw rate and sideslip change within tenths of a second: what corrects a sweep must be as fresh as this \[s\].
 const RECENT: f64 = 0.04;
 
 /// A yaw rate of which its error is hardly a share [rad/s].
@@ -76,7 +76,7 @@ const HARDLY: f64 = 0.5;
 const WALKING: f64 = 1.0;
 
 impl SlipWindow {
-    /// Adds one scan's motion: by the wheels [m], by odometry less the slip expected, and by the posterior, each in the
+    /// Adds one scan's motion: by the wheels \[m\], by odometry less the slip expected, and by the posterior, each in the
     /// frame of its own start.
     pub(crate) fn push(
         &mut self,

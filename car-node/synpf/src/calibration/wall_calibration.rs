@@ -10,9 +10,9 @@ use maps::{DistanceField, Pose};
 /// The walls as a laser sees them, learned while driving.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct WallCalibration {
-    /// How much nearer they stand than the map has them [m].
+    /// How much nearer they stand than the map has them \[m\].
     pub(crate) offset: f64,
-    /// Standard deviation of the end points about them [m]; 0 before anything was seen.
+    /// Standard deviation of the end points about them \[m\]; 0 before anything was seen.
     pub(crate) scatter: f64,
     /// How far the end points of one stretch of wall err together, and how long a stretch stays in view.
     shared: Shared,
@@ -26,13 +26,13 @@ struct Shared {
     common: f64,
     /// Sum of their squares [m^2].
     own: f64,
-    /// How far the laser sees on average [m].
+    /// How far the laser sees on average \[m\].
     view: f64,
-    /// Way between two scans [m].
+    /// Way between two scans \[m\].
     step: f64,
 }
 
-/// End points farther from all walls are no hits of theirs [m].
+/// End points farther from all walls are no hits of theirs \[m\].
 const REACH: f32 = 0.25;
 
 /// As many end points at least make an observation.
@@ -44,7 +44,7 @@ const MOST: usize = 180;
 /// Length of a stretch of wall whose end points are taken to err together [m]: a board, a person, a bend of the map.
 const STRETCH: f32 = 1.0;
 
-/// End points farther apart than this are on different walls [m].
+/// End points farther apart than this are on different walls \[m\].
 const GAP: f32 = 0.3;
 
 /// A stretch counts as seen by so many scans at most.
@@ -144,9 +144,9 @@ impl WallCalibration {
 
     /// Takes in what one scan showed, after so much driving [m]: a car that stands sees the same again.
     pub(crate) fn learn(&mut self, seen: Self, driven: f64, distance: f64) {
-        /// More is not a map's grain [m].
+        /// More is not a map's grain \[m\].
         const MOST_OFFSET: f64 = 0.05;
-        /// More is a wrong pose [m].
+        /// More is a wrong pose \[m\].
         const MOST_SCATTER: f64 = 0.1;
         let gain = 1.0 - (-driven.abs() / distance).exp();
         self.offset = (self.offset + gain * (seen.offset - self.offset)).clamp(-MOST_OFFSET, MOST_OFFSET);

@@ -18,7 +18,7 @@ pub(crate) struct Continuity {
     reference: Vec<[f32; 2]>,
     /// The motion since by odometry, and by the estimate.
     moved: [Pose; 2],
-    /// Time since [s].
+    /// Time since \[s\].
     seconds: f64,
     /// Share of the beams that disagree, as is usual.
     usual: f64,
@@ -48,7 +48,7 @@ const DIRECTIONS: usize = 720;
 /// An end point is compared with those so many directions to both sides: odometry errs in heading, and walls are slanted.
 const NEIGHBOURS: usize = 3;
 
-/// A range that differs by less than this agrees [m], and by this share of itself.
+/// A range that differs by less than this agrees \[m\], and by this share of itself.
 const TOLERANCE: [f32; 2] = [0.15, 0.02];
 
 /// Points of a reference, and of a scan compared with it.
@@ -60,13 +60,13 @@ const FEWEST: usize = 8;
 /// Disagreement is never taken for less usual than this: two beams of sixty.
 const LEAST_USUAL: f64 = 0.03;
 
-/// Time over which the usual disagreement is learned [s].
+/// Time over which the usual disagreement is learned \[s\].
 const LEARNED_OVER: f64 = 2.0;
 
-/// For so long [s] and so far [m] a scan is kept that those after it do not agree with: one bad scan is no break.
+/// For so long \[s\] and so far \[m\] a scan is kept that those after it do not agree with: one bad scan is no break.
 const KEPT: [f64; 2] = [0.4, 1.0];
 
-/// Longer than this [s] and farther than this [m], the view is another one anyway.
+/// Longer than this \[s\] and farther than this \[m\], the view is another one anyway.
 const COMPARABLE: [f64; 2] = [0.6, 2.0];
 
 impl Continuity {

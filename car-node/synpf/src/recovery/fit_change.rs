@@ -10,18 +10,18 @@
 pub(crate) struct FitChangeDetector {
     /// Mean fit and mean distance from it, over the long term.
     usual: Option<[f64; 2]>,
-    /// For how long fits have come in [s].
+    /// For how long fits have come in \[s\].
     seconds: f64,
-    /// For how long the fit has been far below the usual one [s]; None while it is not.
+    /// For how long the fit has been far below the usual one \[s\]; None while it is not.
     below_for: Option<f64>,
     /// The cumulative sum, in variations times seconds.
     evidence: f64,
 }
 
-/// Time over which the usual fit is learned [s].
+/// Time over which the usual fit is learned \[s\].
 const LEARNED_OVER: f64 = 2.5;
 
-/// Time until it is known [s].
+/// Time until it is known \[s\].
 const KNOWN: f64 = 2.0;
 
 /// So many variations below the mean are common, on end too: maps differ from place to place...
@@ -42,7 +42,7 @@ impl FitChangeDetector {
         self.usual.filter(|_| self.seconds > KNOWN).map(|[mean, _]| mean)
     }
 
-    /// Takes in the fit of a scan, in [0, 1], and the time since the one before [s]. True when it has changed for the worse.
+    /// Takes in the fit of a scan, in [0, 1], and the time since the one before \[s\]. True when it has changed for the worse.
     pub(crate) fn push(&mut self, fit: f64, seconds: f64) -> bool {
         let [mean, variation] = *self.usual.get_or_insert([fit, 0.05]);
         self.seconds += seconds;
@@ -65,7 +65,7 @@ impl FitChangeDetector {
 mod tests {
     use super::*;
 
-    /// The time at which a change is first seen [s].
+    /// The time at which a change is first seen \[s\].
     fn first(rate: f64, seconds: f64, fit: impl Fn(f64) -> f64) -> Option<f64> {
         let mut detector = FitChangeDetector::default();
         let scans = (seconds * rate) as usize;

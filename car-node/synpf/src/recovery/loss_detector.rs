@@ -17,7 +17,7 @@ pub(crate) struct LossDetector {
     breaking: Option<Break>,
     /// A break has lasted.
     carried: bool,
-    /// For how long the scans have contradicted the pose since a break [s].
+    /// For how long the scans have contradicted the pose since a break \[s\].
     contradicted_for: f64,
 }
 
@@ -45,7 +45,7 @@ const LOSS: f64 = 2.0;
 const DOUBTFUL: f64 = 4.0;
 
 impl LossDetector {
-    /// Takes in how a scan goes on from the one before, how it fits, and the way since [m]. `leading` says that another
+    /// Takes in how a scan goes on from the one before, how it fits, and the way since \[m\]. `leading` says that another
     /// place explains more.
     pub(crate) fn push(
         &mut self,

@@ -16,7 +16,7 @@ use crate::track_map::TrackMap;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Rivals {
     list: Vec<Rival>,
-    /// The incumbent's score, averaged like a rival's, over so many scans and so long [s].
+    /// The incumbent's score, averaged like a rival's, over so many scans and so long \[s\].
     own: f64,
     scans: u32,
     seconds: f64,
@@ -29,7 +29,7 @@ pub(crate) struct Rivals {
 #[derive(Debug, Clone)]
 pub(crate) struct Rival {
     pub(crate) candidate: Candidate,
-    /// How far the car has driven since it joined [m].
+    /// How far the car has driven since it joined \[m\].
     pub(crate) driven: f64,
     /// Pieces of wall that it explains and the incumbent does not, and the other way round.
     pieces: [Pieces; 2],
@@ -53,7 +53,7 @@ const WORSE: f64 = 4.0;
 /// A rival that is behind by so many pieces is dropped.
 const BEHIND: f64 = 8.0;
 
-/// Nearer than this a pose is the same place, and the filter's to mend [m].
+/// Nearer than this a pose is the same place, and the filter's to mend \[m\].
 const NEARBY: f64 = 0.5;
 
 /// Evidence older than this way is forgotten [m]: a wrong pose shows itself within 8 m.
@@ -68,7 +68,7 @@ pub(crate) struct Incumbent<'a> {
     pub(crate) map: &'a TrackMap,
     pub(crate) scan: &'a PreprocessedScan,
     pub(crate) pose: Pose,
-    /// How far from a wall an end point may lie [m].
+    /// How far from a wall an end point may lie \[m\].
     pub(crate) reach: f32,
 }
 
@@ -169,12 +169,12 @@ impl Rivals {
         self.list.first()
     }
 
-    /// How long they have been followed [s].
+    /// How long they have been followed \[s\].
     pub(crate) fn seconds(&self) -> f64 {
         self.seconds
     }
 
-    /// All as candidates of a search, the incumbent among them, and how far the car has driven with them [m].
+    /// All as candidates of a search, the incumbent among them, and how far the car has driven with them \[m\].
     pub(crate) fn take(&mut self, incumbent: &Estimate) -> (Vec<Candidate>, f64) {
         let own = Candidate::followed(*incumbent, self.own, self.scans, self.seconds);
         let driven = self.driven;

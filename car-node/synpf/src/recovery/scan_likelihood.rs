@@ -20,13 +20,13 @@ const SCORED: usize = 60;
 /// Beams that are sorted into pieces.
 const SORTED: usize = 120;
 
-/// Edge of a piece of wall [m].
+/// Edge of a piece of wall \[m\].
 const PIECE: f32 = 0.5;
 
 /// Weight of a beam that says nothing.
 const NEUTRAL: f32 = 0.5;
 
-/// A range that differs by more than this from the map's is another thing [m].
+/// A range that differs by more than this from the map's is another thing \[m\].
 const OTHER: f32 = 0.3;
 
 /// What a beam says of a pose.
@@ -42,7 +42,7 @@ pub(crate) enum Explained {
     Unclear,
 }
 
-/// Sorts the beams of a scan at a pose in the grid's frame. `reach` is how far from a wall an end point may lie [m].
+/// Sorts the beams of a scan at a pose in the grid's frame. `reach` is how far from a wall an end point may lie \[m\].
 pub(crate) fn explain(
     map: &TrackMap,
     scan: &PreprocessedScan,
@@ -84,7 +84,7 @@ pub(crate) fn explain(
     }));
 }
 
-/// The piece of wall at a point of the grid [m].
+/// The piece of wall at a point of the grid \[m\].
 fn piece(at: [f32; 2]) -> u32 {
     let [u, v] = at.map(|v| ((v / PIECE) as i32).clamp(0, 0xffff) as u32);
     u << 16 | v
@@ -102,7 +102,7 @@ struct Seen {
     beams: u32,
     /// How much it counts, at most 1.
     weight: f32,
-    /// How far the car had driven when it was last seen [m].
+    /// How far the car had driven when it was last seen \[m\].
     at: f32,
 }
 

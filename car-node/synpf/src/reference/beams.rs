@@ -1,6 +1,6 @@
 //! The reference's choice of beams: about evenly spaced along the outline of a corridor.
 
-/// Indices of the chosen beams of a scan, in order. `angle_min` and `increment` [rad] are the scan's, `length_over_width`
+/// Indices of the chosen beams of a scan, in order. `angle_min` and `increment` \[rad\] are the scan's, `length_over_width`
 /// the corridor's, `wanted` how many.
 ///
 /// From the middle beam to one side, each beam before the one at which the way along the outline since the last

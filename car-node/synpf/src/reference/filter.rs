@@ -23,15 +23,15 @@ use crate::track_map::TrackMap;
 
 /// Weight of a particle off the track.
 const OFF_TRACK: f64 = 0.01;
-/// Longest that odometry is carried on beyond its last message [s]; a scan later than that is dropped.
+/// Longest that odometry is carried on beyond its last message \[s\]; a scan later than that is dropped.
 const CARRY: f64 = 0.25;
 /// Odometry and yaw rates are kept for so many messages, for a localizer that takes over: 2 s at 200 Hz.
 const KEPT: usize = 400;
-/// A search has ended when the particles' spread is less than this [m].
+/// A search has ended when the particles' spread is less than this \[m\].
 const FOUND: f64 = 0.5;
 /// Clusters that a search has found, at most.
 const MOST_HYPOTHESES: usize = 5;
-/// Particles spread wider than this may be in two places [m].
+/// Particles spread wider than this may be in two places \[m\].
 const WIDE: f64 = 0.2;
 
 /// The reference, a localizer. One thread owns it; the map is shared.
@@ -66,7 +66,7 @@ struct Posterior {
     odom: Pose,
     mean: Pose,
     covariance: Matrix3<f64>,
-    /// How far the mean moved beyond odometry in the last tick: distance [m] and angle [rad].
+    /// How far the mean moved beyond odometry in the last tick: distance \[m\] and angle \[rad\].
     innovation: [f64; 2],
 }
 
@@ -92,11 +92,11 @@ struct Beams {
     /// Number of beams, first angle and increment that `chosen` is for, and the parameters that it depends on.
     geometry: Option<(usize, f64, f64, f64, usize)>,
     chosen: Vec<usize>,
-    /// Direction of each chosen beam in the frame of `base_link` [rad].
+    /// Direction of each chosen beam in the frame of `base_link` \[rad\].
     angles: Vec<f64>,
     /// What each measured, in cells.
     observed: Vec<u16>,
-    /// End points of all beams with a return, in the frame of `base_link` [m].
+    /// End points of all beams with a return, in the frame of `base_link` \[m\].
     points: Vec<[f32; 2]>,
 }
 
@@ -303,7 +303,7 @@ impl Reference {
         self.particles.set_weights(&self.log_likelihoods);
     }
 
-    /// Odometry's pose and velocity at a stamp: between two messages, or carried on by the last for at most `carry` [s].
+    /// Odometry's pose and velocity at a stamp: between two messages, or carried on by the last for at most `carry` \[s\].
     fn odometry_at(&self, stamp: Stamp, carry: f64) -> Option<(Pose, Twist)> {
         let after = self.odometry.partition_point(|odometry| odometry.stamp <= stamp);
         let from = self.odometry.get(after.saturating_sub(1))?;
@@ -633,7 +633,7 @@ fn sound(scan: &Scan) -> bool {
         && !scan.range_max.is_nan()
 }
 
-/// End points of the beams with a return, in the frame of `base_link` [m].
+/// End points of the beams with a return, in the frame of `base_link` \[m\].
 fn end_points(
     scan: &Scan,
     base_link_from_laser: Pose,
@@ -649,14 +649,14 @@ fn end_points(
     scan.ranges.iter().enumerate().filter_map(point)
 }
 
-/// A covariance in axes turned by `heading` [rad].
+/// A covariance in axes turned by `heading` \[rad\].
 fn turned(covariance: &Matrix3<f64>, heading: f64) -> Matrix3<f64> {
     let (sin, cos) = heading.sin_cos();
     let turn = Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0);
     turn * covariance * turn.transpose()
 }
 
-/// Standard deviations along and across a heading [m].
+/// Standard deviations along and across a heading \[m\].
 fn along_and_across(covariance: &Matrix3<f64>, heading: f64) -> [f64; 2] {
     let own = turned(covariance, -heading);
     [own[(0, 0)], own[(1, 1)]].map(|variance| variance.max(0.0).sqrt())

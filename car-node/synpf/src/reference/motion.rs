@@ -13,7 +13,7 @@ pub(super) struct Step {
     pub(super) motion: Pose,
     /// The motion before it.
     pub(super) before: Pose,
-    /// How long it took [s].
+    /// How long it took \[s\].
     pub(super) seconds: f64,
     /// Odometry's forward speed at its end [m/s].
     pub(super) speed: f64,
@@ -21,7 +21,7 @@ pub(super) struct Step {
 
 /// The interval that the noise parameters refer to once they no longer count messages [s]: one message at 50 Hz.
 const NOISE_INTERVAL: f64 = 0.02;
-/// Shorter motions per message are thrown away, and have no direction [m].
+/// Shorter motions per message are thrown away, and have no direction \[m\].
 const DEADBAND: f64 = 0.01;
 /// A car that is slower than this reverses [m/s].
 const REVERSING: f64 = -0.05;
@@ -75,7 +75,7 @@ impl Motion {
         }
     }
 
-    /// Moves a particle's x, y [m] and heading [rad].
+    /// Moves a particle's x, y \[m\] and heading \[rad\].
     pub(super) fn apply(&self, [x, y, heading]: [f64; 3], rng: &mut SmallRng) -> [f64; 3] {
         let mut draw = |mean: [f64; 3], sigma: [f64; 3]| {
             [0, 1, 2].map(|i| {
@@ -182,7 +182,7 @@ fn polar(step: &Step, messages: f64, parameters: &ReferenceParameters) -> Motion
     }
 }
 
-/// The size of a rotation, to the nearer of straight ahead and straight back [rad].
+/// The size of a rotation, to the nearer of straight ahead and straight back \[rad\].
 fn folded(rotation: f64) -> f64 {
     let size = rotation.abs();
     size.min(std::f64::consts::PI - size)

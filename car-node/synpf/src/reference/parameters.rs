@@ -33,15 +33,15 @@ pub struct ReferenceParameters {
     pub lidar_aspect_ratio: f64,
     /// The product over the beams is taken to the power 1/this.
     pub squash_factor: f64,
-    /// Ranges from here on are "nothing in range" [m].
+    /// Ranges from here on are "nothing in range" \[m\].
     pub max_range: f64,
     /// Directions that the range table distinguishes.
     pub theta_discretization: u16,
-    /// Standard deviation of a given initial pose along x [m]; a variance by name only.
+    /// Standard deviation of a given initial pose along x \[m\]; a variance by name only.
     pub initial_var_x: f64,
-    /// Standard deviation of a given initial pose along y [m]; a variance by name only.
+    /// Standard deviation of a given initial pose along y \[m\]; a variance by name only.
     pub initial_var_y: f64,
-    /// Standard deviation of a given initial heading [rad]; a variance by name only.
+    /// Standard deviation of a given initial heading \[rad\]; a variance by name only.
     pub initial_var_theta: f64,
     /// Share of beams that hit the wall which the map says.
     pub z_hit: f64,
@@ -51,7 +51,7 @@ pub struct ReferenceParameters {
     pub z_max: f64,
     /// Share of beams with any range at all.
     pub z_rand: f64,
-    /// Standard deviation of a hit [m].
+    /// Standard deviation of a hit \[m\].
     pub sigma_hit: f64,
     /// Decay of the ranges that are too short [1/m]; see [`ReferenceDefects::defect_lambda_short`].
     pub lambda_short: f64,
@@ -65,7 +65,7 @@ pub struct ReferenceParameters {
     pub alpha_3_tum: f64,
     /// `tum`: translation noise from rotation [m/rad].
     pub alpha_4_tum: f64,
-    /// `tum`: translation per message below which `alpha_2_tum` stops growing [m].
+    /// `tum`: translation per message below which `alpha_2_tum` stops growing \[m\].
     pub lam_thresh: f64,
     /// `amcl`: rotation noise from rotation [rad/rad].
     pub alpha_1_amcl: f64,
@@ -83,21 +83,21 @@ pub struct ReferenceParameters {
     pub motion_dispersion_arc_theta: f64,
     /// `arc`: sideways noise from forward motion beyond `motion_dispersion_arc_xy_min_x` [m/m].
     pub motion_dispersion_arc_xy: f64,
-    /// `arc`: least forward noise [m].
+    /// `arc`: least forward noise \[m\].
     pub motion_dispersion_arc_x_min: f64,
-    /// `arc`: least sideways noise [m].
+    /// `arc`: least sideways noise \[m\].
     pub motion_dispersion_arc_y_min: f64,
-    /// `arc`: most sideways noise [m].
+    /// `arc`: most sideways noise \[m\].
     pub motion_dispersion_arc_y_max: f64,
-    /// `arc`: least turning noise [rad].
+    /// `arc`: least turning noise \[rad\].
     pub motion_dispersion_arc_theta_min: f64,
-    /// `arc`: forward motion below which it adds no sideways noise [m].
+    /// `arc`: forward motion below which it adds no sideways noise \[m\].
     pub motion_dispersion_arc_xy_min_x: f64,
-    /// `default`: noise along the map's x axis [m].
+    /// `default`: noise along the map's x axis \[m\].
     pub motion_dispersion_x: f64,
-    /// `default`: noise along the map's y axis [m].
+    /// `default`: noise along the map's y axis \[m\].
     pub motion_dispersion_y: f64,
-    /// `default`: turning noise [rad].
+    /// `default`: turning noise \[rad\].
     pub motion_dispersion_theta: f64,
     /// Its defects, all on as shipped.
     #[serde(flatten)]

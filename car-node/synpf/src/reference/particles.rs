@@ -11,7 +11,7 @@ use super::motion::Motion;
 /// Poses in the grid's frame with weights.
 #[derive(Debug, Clone)]
 pub(super) struct Particles {
-    /// x, y [m], heading [rad].
+    /// x, y \[m\], heading \[rad\].
     pub(super) poses: Vec<[f64; 3]>,
     /// Weights with sum 1.
     pub(super) weights: Vec<f64>,
@@ -30,7 +30,7 @@ pub(super) struct Cluster {
     pub(super) mass: f64,
 }
 
-/// Size of a cluster [m], [rad]: 0.5 m and 20 deg.
+/// Size of a cluster \[m\], [rad]: 0.5 m and 20 deg.
 const CLUSTER: [f64; 2] = [0.5, 0.349_065_85];
 
 impl Particles {

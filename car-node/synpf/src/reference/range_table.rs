@@ -20,7 +20,7 @@ use super::parameters::ReferenceParameters;
 pub(super) struct Method {
     /// Directions that differ.
     pub(super) directions: u16,
-    /// The greatest range [cells].
+    /// The greatest range \[cells\].
     most: u16,
     /// Ranges come out half a cell long.
     long: bool,
@@ -53,7 +53,7 @@ impl Method {
     }
 }
 
-/// Distance from each cell to the nearest occupied one, between centres [cells].
+/// Distance from each cell to the nearest occupied one, between centres \[cells\].
 #[derive(Debug)]
 pub(super) struct Walls {
     width: usize,
@@ -89,7 +89,7 @@ impl Walls {
         }
     }
 
-    /// The range from a cell's corner in a direction [rad], at most `most`, in cells.
+    /// The range from a cell's corner in a direction \[rad\], at most `most`, in cells.
     fn range(&self, [column, row]: [i32; 2], angle: f32, most: f32) -> f32 {
         let (x0, y0) = (column as f32, row as f32);
         let (sin, cos) = angle.sin_cos();
@@ -227,7 +227,7 @@ impl RangeTables {
         tables.get(&(region, method)).cloned()
     }
 
-    /// Memory that all this takes [bytes].
+    /// Memory that all this takes \[bytes\].
     pub(crate) fn bytes(&self) -> usize {
         let tables = self.tables.lock().unwrap_or_else(PoisonError::into_inner);
         tables.values().map(|table| table.bytes()).sum::<usize>()

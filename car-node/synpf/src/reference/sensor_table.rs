@@ -2,7 +2,7 @@
 
 use super::parameters::ReferenceParameters;
 
-/// Log-likelihoods by the observed and the predicted range [cells].
+/// Log-likelihoods by the observed and the predicted range \[cells\].
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SensorTable {
     /// Cells up to the greatest range, which counts as no return.
@@ -60,7 +60,7 @@ impl SensorTable {
         }
     }
 
-    /// A range [m] in cells, rounded down; what is no number is no return.
+    /// A range \[m\] in cells, rounded down; what is no number is no return.
     pub(super) fn cell(&self, range: f32) -> u16 {
         if range.is_nan() {
             return self.most;
@@ -68,7 +68,7 @@ impl SensorTable {
         (range * self.cells_per_metre).clamp(0.0, f32::from(self.most)) as u16
     }
 
-    /// Log-likelihoods of an observed range [cells] by the predicted one [cells].
+    /// Log-likelihoods of an observed range \[cells\] by the predicted one \[cells\].
     pub(super) fn row(&self, observed: u16) -> &[f32] {
         let width = usize::from(self.most) + 1;
         &self.rows[usize::from(observed) * width..][..width]

@@ -12,7 +12,7 @@ pub(super) struct LinearFit {
 }
 
 impl LinearFit {
-    /// Adds a pair that held for `seconds`; what is older than `memory` [s] counts less and less.
+    /// Adds a pair that held for `seconds`; what is older than `memory` \[s\] counts less and less.
     pub(super) fn add(&mut self, x: f64, y: f64, seconds: f64, memory: f64) {
         let keep = (-seconds / memory).exp();
         for sum in [
@@ -33,7 +33,7 @@ impl LinearFit {
         self.yy += y * y * seconds;
     }
 
-    /// For how long pairs have come in [s], at most the memory.
+    /// For how long pairs have come in \[s\], at most the memory.
     pub(super) fn seconds(&self) -> f64 {
         self.weight
     }

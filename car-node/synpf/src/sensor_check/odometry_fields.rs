@@ -12,12 +12,12 @@ pub(crate) struct OdometryFields {
     last: Option<Odometry>,
     /// Where the pose that is passed on is.
     pose: Pose,
-    /// Distance by the pose and by the twist, the older stretches forgotten [m].
+    /// Distance by the pose and by the twist, the older stretches forgotten \[m\].
     by_pose: f64,
     by_twist: f64,
     /// The pose does not move, or has no orientation.
     no_pose: bool,
-    /// Distance by the twist while the pose stood still [m].
+    /// Distance by the twist while the pose stood still \[m\].
     still: f64,
     /// The twist is zero, or does not fit the pose: what it says of the distance.
     wrong_twist: Option<f64>,
@@ -31,10 +31,10 @@ pub(crate) struct OdometryFields {
 /// leaves it, and elsewhere, where it may be coarse.
 const STILL: [f64; 2] = [0.05, 0.6];
 
-/// How far the pose must go to judge the twist [m].
+/// How far the pose must go to judge the twist \[m\].
 const MOVED: f64 = 0.2;
 
-/// Distances are compared over this [m].
+/// Distances are compared over this \[m\].
 const MEMORY: f64 = 2.0;
 
 /// A twist that says more or less than this many times the pose's distance is wrong: both come from the same wheels.
@@ -46,7 +46,7 @@ const SPAN: f64 = 0.045;
 /// A step by the pose beyond this speed is a jump [m/s].
 const FASTEST: f64 = 30.0;
 
-/// No message for so long: what the twist was in between is unknown [s].
+/// No message for so long: what the twist was in between is unknown \[s\].
 const GAP: f64 = 0.5;
 
 impl OdometryFields {
@@ -133,7 +133,7 @@ impl OdometryFields {
         }
     }
 
-    /// Compares the distances of one step [m].
+    /// Compares the distances of one step \[m\].
     fn judge_twist(&mut self, by_pose: f64, by_twist: f64) {
         let keep = (-by_pose.abs() / MEMORY).exp();
         // Forwards as the pose goes.

@@ -17,7 +17,7 @@ pub(super) struct RepeatedScan {
 const LEAST_READINGS: usize = 20;
 
 /// A car that stands in front of a simulated laser without noise sees the same scan again. One that has moved by this does
-/// not [m], [rad].
+/// not \[m\], \[rad\].
 const MOVED: [f64; 2] = [0.02, 0.01];
 
 impl RepeatedScan {

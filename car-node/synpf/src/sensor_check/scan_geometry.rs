@@ -9,19 +9,19 @@ use super::sweep_check::SweepCheck;
 /// By what a scan's beams are placed in space and time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ScanGeometry {
-    /// Angle from one beam to the next, signed [rad].
+    /// Angle from one beam to the next, signed \[rad\].
     pub(crate) angle_increment: f64,
-    /// Time from one beam to the next [s].
+    /// Time from one beam to the next \[s\].
     pub(crate) time_increment: f64,
-    /// Readings from here on mean "nothing in range" [m].
+    /// Readings from here on mean "nothing in range" \[m\].
     pub(crate) range_max: f64,
-    /// The time from one beam to the next that the scan may have instead [s].
+    /// The time from one beam to the next that the scan may have instead \[s\].
     pub(crate) alternative: Option<f64>,
-    /// How late the stamp is against odometry's [s].
+    /// How late the stamp is against odometry's \[s\].
     pub(crate) lag: f64,
 }
 
-/// Smaller angles between beams are none [rad].
+/// Smaller angles between beams are none \[rad\].
 const LEAST_ANGLE: f64 = 1e-6;
 
 /// Within so much of the time of a whole scan [s/s], the beams' times add up; `time_increment` beyond it is wrong.

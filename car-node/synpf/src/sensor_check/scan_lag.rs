@@ -14,10 +14,10 @@ pub(crate) struct ScanLag {
 /// Lags that are tried, [`STEP`] apart, around none.
 const CANDIDATES: usize = 25;
 
-/// From one candidate to the next [s].
+/// From one candidate to the next \[s\].
 const STEP: f64 = 0.01;
 
-/// How far back turns count [s].
+/// How far back turns count \[s\].
 const MEMORY: f64 = 60.0;
 
 /// Least turning to judge by, as the sum of the squares of the yaw rate about its mean [rad^2/s]: a few bends.
@@ -33,15 +33,15 @@ const BETTER: f64 = 3.0;
 const MOST_LEFT: f64 = 0.1;
 
 impl ScanLag {
-    /// The longest lag that is found [s].
+    /// The longest lag that is found \[s\].
     pub(crate) const LONGEST: f64 = STEP * (CANDIDATES / 2) as f64;
 
-    /// How late the scans' stamps are against odometry's [s]; 0 while none is known.
+    /// How late the scans' stamps are against odometry's \[s\]; 0 while none is known.
     pub(crate) fn lag(&self) -> f64 {
         self.lag
     }
 
-    /// Takes in a turn by the scans [rad] over `seconds`. `between` gives what odometry said over the same time, earlier by a lag.
+    /// Takes in a turn by the scans \[rad\] over `seconds`. `between` gives what odometry said over the same time, earlier by a lag.
     pub(super) fn learn(&mut self, seconds: f64, turn: f64, between: impl Fn(f64) -> Option<DrivenSums>) {
         for (index, fit) in self.fits.iter_mut().enumerate() {
             let lag = Self::candidate(index);

@@ -8,7 +8,7 @@ use super::{DrivenSums, ScanGeometry};
 /// Holds scans against one from the time when the car became slow: do they look as if it had moved since, or not?
 #[derive(Debug, Clone, Default)]
 pub(super) struct Standstill {
-    /// Readings of that scan [m]; empty without one.
+    /// Readings of that scan \[m\]; empty without one.
     ranges: Vec<f32>,
     /// The sums at that time.
     driven: DrivenSums,
@@ -20,10 +20,10 @@ pub(super) struct Standstill {
 /// Odometry of a car at standstill creeps more slowly [m/s]: a speed controller's offset is about a tenth.
 const SLOW: f64 = 0.3;
 
-/// A motion is judged when odometry claims this much of it [m], [rad].
+/// A motion is judged when odometry claims this much of it \[m\], \[rad\].
 const CLAIMED: [f64; 2] = [0.02, 0.01];
 
-/// ...and given up for judging, when it claims so much [m].
+/// ...and given up for judging, when it claims so much \[m\].
 const TOO_FAR: f64 = 0.1;
 
 /// Readings that are compared, at most.
@@ -32,13 +32,13 @@ const READINGS: usize = 120;
 /// Fewer say nothing.
 const LEAST_READINGS: usize = 20;
 
-/// Range noise of a good laser [m].
+/// Range noise of a good laser \[m\].
 const NOISE: f64 = 0.01;
 
 /// By how much the likelihood of one explanation must exceed the other's, as a logarithm.
 const SURE: f64 = 12.0;
 
-/// The direction of a wall is taken over this length to both sides [m]...
+/// The direction of a wall is taken over this length to both sides \[m\]...
 const WALL: f64 = 0.2;
 /// ...but over no more beams than this.
 const WALL_BEAMS: usize = 40;

@@ -20,7 +20,7 @@ const SURE: f64 = 6.0;
 /// After so many scans without a decision the scan is taken as it is stated.
 const MOST_SCANS: u32 = 400;
 
-/// A sweep of a car that moves by less is a scan at one time [m], [rad].
+/// A sweep of a car that moves by less is a scan at one time \[m\], \[rad\].
 const MOVES: [f64; 2] = [0.02, 0.01];
 
 impl SweepCheck {

@@ -23,7 +23,7 @@ impl Default for TurnCorrection {
 }
 
 impl TurnCorrection {
-    /// The turn of the car [rad] where the sensor says `turn` over `seconds`.
+    /// The turn of the car \[rad\] where the sensor says `turn` over `seconds`.
     pub(crate) fn corrected(self, turn: f64, seconds: f64) -> f64 {
         self.factor * (turn - self.bias * seconds)
     }
@@ -36,7 +36,7 @@ const MEMORY: f64 = 30.0;
 /// scans is good to 0.002 rad, so that stretches of 0.1 s of half a minute have 0.02.
 const TURNING: f64 = 0.5;
 
-/// Least time to judge a yaw rate by [s].
+/// Least time to judge a yaw rate by \[s\].
 const LISTENED: f64 = 1.0;
 
 /// A sensor that leaves more of the turn unexplained is of no use.

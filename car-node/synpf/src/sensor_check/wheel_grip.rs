@@ -24,7 +24,7 @@ struct Sliding {
     gripping: u32,
 }
 
-/// Speeds are compared over this [s].
+/// Speeds are compared over this \[s\].
 const SPAN: f64 = 0.08;
 
 /// No tyre accelerates or brakes a car harder [m/s^2]: a coefficient of friction of 1.2.
@@ -44,7 +44,7 @@ const GRIPPING: u32 = 3;
 /// A speed by the scans that differs by more is none: the pose was found elsewhere [m/s].
 const PLAUSIBLE: f64 = 3.0;
 
-/// Longer than this no wheel slides: the car was held, or its speed was misjudged [s].
+/// Longer than this no wheel slides: the car was held, or its speed was misjudged \[s\].
 const LONGEST: f64 = 2.0;
 
 impl WheelGrip {
@@ -118,7 +118,7 @@ impl WheelGrip {
 mod tests {
     use super::*;
 
-    /// Distance that the car is said to go in 2 s at 50 Hz with wheels of this speed [m].
+    /// Distance that the car is said to go in 2 s at 50 Hz with wheels of this speed \[m\].
     fn driven(wheels: impl Fn(f64) -> f64) -> f64 {
         let mut grip = WheelGrip::default();
         (0..100)

@@ -8,9 +8,9 @@ use super::Stretch;
 #[derive(Debug, Clone)]
 pub(super) struct WheelScale {
     scale: f64,
-    /// Wheel distance, weighed by how well the scans tell the distance [m].
+    /// Wheel distance, weighed by how well the scans tell the distance \[m\].
     weight: f64,
-    /// The same, not weighed [m].
+    /// The same, not weighed \[m\].
     driven: f64,
     /// Sums of the ratio, scans over wheels, and of its squares.
     ratio: f64,
@@ -29,10 +29,10 @@ impl Default for WheelScale {
     }
 }
 
-/// How far back distances count [m].
+/// How far back distances count \[m\].
 const MEMORY: f64 = 20.0;
 
-/// Least distance to judge the scale by, weighed and not [m].
+/// Least distance to judge the scale by, weighed and not \[m\].
 const LEAST: [f64; 2] = [0.7, 2.0];
 
 /// Tyres within their limit slip by less: a longitudinal slip of 0.1 is where their force peaks (Pacejka, *Tire and

@@ -101,7 +101,7 @@ pub(crate) fn stamp(seconds: f64) -> Stamp {
     Stamp(1_700_000_000_000_000_000).plus(seconds)
 }
 
-/// Time that one lap takes [s].
+/// Time that one lap takes \[s\].
 #[allow(dead_code, reason = "not every user of this module needs all of it")]
 pub(crate) fn lap() -> f64 {
     TAU * 7.0 / SPEED

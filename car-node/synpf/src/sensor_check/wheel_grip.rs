@@ -17,6 +17,8 @@ pub(crate) struct WheelGrip {
 struct Sliding {
     since: Stamp,
     at: Stamp,
+    /// 1 for wheels that began to spin, -1 for wheels that locked.
+    onset: f64,
     /// The car's speed before [m/s], and now.
     before: f64,
     car: f64,
@@ -67,10 +69,21 @@ impl WheelGrip {
             self.sliding = onset.map(|&(since, car)| Sliding {
                 since,
                 at: since,
+                onset: (wheels - car).signum(),
                 before: car,
                 car,
                 gripping: 0,
             });
+        }
+        // Wheels that jump back have caught the ground, whatever the car's speed was thought to be.
+        let caught = self.sliding.is_some_and(|sliding| {
+            self.speeds.iter().any(|(then, before)| {
+                sliding.onset * (before - wheels) > HARDEST * stamp.since(*then) + NOISE
+            })
+        });
+        if caught {
+            self.sliding = None;
+            self.speeds.clear();
         }
         self.speeds.push_back((stamp, wheels));
         let Some(sliding) = &mut self.sliding else {
@@ -141,6 +154,19 @@ mod tests {
         let distance = driven(|t| if (0.5..0.8).contains(&t) { 6.0 } else { 3.0 });
         // At 6 m/s it would be 6.9 m.
         assert!((6.0..6.6).contains(&distance), "{distance}");
+    }
+
+    #[test]
+    fn wheels_that_catch_the_ground_again_are_believed_at_once() {
+        // The car rolls on at 5 m/s: it was a fault of the reading, or ice.
+        let mut grip = WheelGrip::default();
+        for i in 0..100 {
+            let t = f64::from(i) * 0.02;
+            let wheels = if (0.5..1.0).contains(&t) { 0.0 } else { 5.0 };
+            let car = grip.speed(Stamp(0).plus(t), wheels);
+            assert!(t < 1.0 || car > 4.99, "{car} m/s at {t} s");
+        }
+        assert!(!grip.is_sliding());
     }
 
     #[test]

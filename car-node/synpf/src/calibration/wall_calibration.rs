@@ -54,11 +54,11 @@ impl Shared {
     /// By how much the variance of a sum over the end points of all scans that see a stretch exceeds what it were if they erred
     /// independently (the design effect of Kish, Survey Sampling, 1965): 1 + (number that err together - 1) times their
     /// correlation.
-    fn design_effect(&self) -> f64 {
+    fn design_effect(&self, most_scans: f64) -> f64 {
         if self.own <= 0.0 {
             return 1.0;
         }
-        let scans = (self.view / self.step.max(1e-3)).clamp(1.0, MOST_SCANS);
+        let scans = (self.view / self.step.max(1e-3)).clamp(1.0, most_scans.max(1.0));
         1.0 + scans * (self.common / self.own).max(0.0)
     }
 }
@@ -66,7 +66,12 @@ impl Shared {
 impl WallCalibration {
     /// How many end points count as one, by what those of one stretch have in common.
     pub(crate) fn correlation(&self) -> f64 {
-        self.shared.design_effect()
+        self.shared.design_effect(MOST_SCANS)
+    }
+
+    /// The same, for an estimate that holds the errors of so many scans.
+    pub(crate) fn correlation_within(&self, scans: f64) -> f64 {
+        self.shared.design_effect(scans.min(MOST_SCANS))
     }
 
     /// Walls of a sound map that a laser of 2 cm sees, but for what their end points have in common.

@@ -105,7 +105,7 @@ mod tests {
         assert!(
             findings
                 .iter()
-                .all(|(finding, value)| value == finding as usize as f64)
+                .all(|(finding, value)| (value - finding as usize as f64).abs() < 1e-9)
         );
         assert_eq!(findings.iter().count(), SensorFinding::ALL.len());
     }

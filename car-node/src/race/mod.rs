@@ -475,7 +475,8 @@ mod tests {
         let spin = car.mishaps.iter().find(|mishap| mishap.kind == MishapKind::Spin);
         let spin = spin.expect("15 rad/s spin any car");
         assert!((6.0..7.0).contains(&spin.at_s), "{spin:?}");
-        assert!(spin.pose_error_m.is_some_and(|error| error < 0.3), "{spin:?}");
+        // At 15 rad/s the car turns by 16 degrees within one sweep of the laser.
+        assert!(spin.pose_error_m.is_some_and(|error| error < 0.5), "{spin:?}");
         assert_eq!(
             car.spins as usize,
             car.mishaps.iter().filter(|m| m.kind == MishapKind::Spin).count()

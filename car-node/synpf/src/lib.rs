@@ -36,8 +36,10 @@
 //! let update = localizer.on_scan(&Scan {
 //!     stamp,
 //!     angle_min: -2.3,
+//!     angle_max: None,
 //!     angle_increment: 0.01,
 //!     time_increment: 0.0,
+//!     scan_time: None,
 //!     range_min: 0.05,
 //!     range_max: 10.0,
 //!     ranges: (0..461).map(range).collect(),

@@ -64,12 +64,8 @@ impl Shared {
 }
 
 impl WallCalibration {
-    /// How many end points count as one, by what those of one stretch have in common.
-    pub(crate) fn correlation(&self) -> f64 {
-        self.shared.design_effect(MOST_SCANS)
-    }
-
-    /// The same, for an estimate that holds the errors of so many scans.
+    /// How many end points count as one, by what those of one stretch have in common, for an estimate that holds the errors of so
+    /// many scans.
     pub(crate) fn correlation_within(&self, scans: f64) -> f64 {
         self.shared.design_effect(scans.min(MOST_SCANS))
     }
@@ -222,7 +218,7 @@ mod tests {
                 let seen = WallCalibration::seen(&field, points, pose, walls).expect("a wall in view");
                 walls.learn(seen, 0.1, 3.0);
             }
-            walls.correlation()
+            walls.correlation_within(f64::INFINITY)
         };
         let plain = hits(0.0, 0.02);
         let mut boarded = plain.clone();

@@ -6,6 +6,7 @@ use localizer::{Dropped, Odometry, SensorFindings, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::calibration::{Drive, SlipModel};
+use crate::received::{KEPT, is_possible, keep_yaw_rate};
 use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, WheelGrip};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
@@ -33,12 +34,6 @@ pub(crate) struct OdometryTrack {
     /// What would bring the poses that follow the last jumps, in the smooth frame, to where they are if the car jumped.
     discontinuity: Option<Pose>,
 }
-
-/// Longest that odometry is carried on beyond its last message \[s\]; a scan later than that is dropped.
-pub(crate) const CARRY: f64 = 0.25;
-
-/// As much as a late scan can need: 2 s at 200 Hz.
-const KEPT: usize = 400;
 
 /// A step is a jump if it differs by more than this from what the twist says \[m\], \[rad\]...
 const JUMP: [f64; 2] = [0.3, 0.3];
@@ -97,20 +92,7 @@ impl OdometryTrack {
         use_imu: bool,
         slip: &SlipModel,
     ) -> Result<(), Dropped> {
-        let Twist {
-            linear_x,
-            linear_y,
-            angular,
-        } = odometry.twist;
-        let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
-        // Faster than any car of this kind: a broken driver, and no use to the filter. A heading that is not finite is an
-        // orientation that nobody has set.
-        let sound = sane(odometry.pose.x, 1e7)
-            && sane(odometry.pose.y, 1e7)
-            && sane(linear_x, 100.0)
-            && sane(linear_y, 100.0)
-            && sane(angular, 100.0);
-        if !sound {
+        if !is_possible(odometry) {
             return Err(Dropped::Malformed);
         }
         if self
@@ -264,21 +246,7 @@ impl OdometryTrack {
     }
 
     pub(crate) fn push_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < 100.0) {
-            return Err(Dropped::Malformed);
-        }
-        if self
-            .yaw_rates
-            .back()
-            .is_some_and(|last| yaw_rate.stamp <= last.stamp)
-        {
-            return Err(Dropped::TimeBackwards);
-        }
-        self.yaw_rates.push_back(*yaw_rate);
-        if self.yaw_rates.len() > KEPT {
-            self.yaw_rates.pop_front();
-        }
-        Ok(())
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate)
     }
 
     /// The jumps since this was last asked, as a motion of the smooth frame: with it in front, later poses are where they

@@ -245,12 +245,12 @@ impl TrackMap {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::Parameters;
 
     /// A room of 5 x 5 m.
-    fn room() -> TrackMap {
+    pub(crate) fn room() -> TrackMap {
         let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
         let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
         let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());

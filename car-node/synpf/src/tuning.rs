@@ -87,15 +87,7 @@ impl TrackMap {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use maps::{Cell, OccupancyGrid};
-
-    /// A room of 5 x 5 m.
-    fn room() -> TrackMap {
-        let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
-        let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
-        let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());
-        TrackMap::new(grid).expect("free space")
-    }
+    use crate::track_map::tests::room;
 
     #[test]
     fn the_memory_of_tables_is_known_before_they_are_built() {

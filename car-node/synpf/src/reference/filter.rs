@@ -19,14 +19,11 @@ use super::range_table::{Method, Table, Walls};
 use super::sensor_table::SensorTable;
 use crate::error::SetUpError;
 use crate::quality::Quality;
+use crate::received::{CARRY, KEPT, is_possible, keep_yaw_rate};
 use crate::track_map::TrackMap;
 
 /// Weight of a particle off the track.
 const OFF_TRACK: f64 = 0.01;
-/// Longest that odometry is carried on beyond its last message \[s\]; a scan later than that is dropped.
-const CARRY: f64 = 0.25;
-/// Odometry and yaw rates are kept for so many messages, for a localizer that takes over: 2 s at 200 Hz.
-const KEPT: usize = 400;
 /// A search has ended when the particles' spread is less than this \[m\].
 const FOUND: f64 = 0.5;
 /// Clusters that a search has found, at most.
@@ -433,15 +430,7 @@ impl Localizer for Reference {
     }
 
     fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
-        let twist = odometry.twist;
-        let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
-        let sound = odometry.pose.is_finite()
-            && sane(odometry.pose.x, 1e7)
-            && sane(odometry.pose.y, 1e7)
-            && [twist.linear_x, twist.linear_y, twist.angular]
-                .iter()
-                .all(|&rate| sane(rate, 100.0));
-        if !sound {
+        if !(odometry.pose.is_finite() && is_possible(odometry)) {
             return Err(Dropped::Malformed);
         }
         let last = self.odometry.back().copied();
@@ -472,7 +461,7 @@ impl Localizer for Reference {
                     motion: odometry.pose.since(posterior.odom),
                     before: self.before,
                     seconds: odometry.stamp.since(posterior.at),
-                    speed: twist.linear_x,
+                    speed: odometry.twist.linear_x,
                 };
                 self.tick(odometry.stamp, odometry.pose, &step);
             }
@@ -482,21 +471,7 @@ impl Localizer for Reference {
     }
 
     fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < 100.0) {
-            return Err(Dropped::Malformed);
-        }
-        if self
-            .yaw_rates
-            .back()
-            .is_some_and(|last| yaw_rate.stamp <= last.stamp)
-        {
-            return Err(Dropped::TimeBackwards);
-        }
-        self.yaw_rates.push_back(*yaw_rate);
-        if self.yaw_rates.len() > KEPT {
-            self.yaw_rates.pop_front();
-        }
-        Ok(())
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate)
     }
 
     fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {

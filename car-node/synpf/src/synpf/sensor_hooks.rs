@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::{Step, SynPf};
 use crate::calibration::SlipModel;
 use crate::estimate::Estimate;
-use crate::odometry_track::CARRY;
+use crate::received::CARRY;
 use crate::scan_matcher::{fit, match_scan};
 use crate::sensor_check::{ScanGeometry, SweepCheck};
 use crate::{Dropped, Mode};

@@ -97,7 +97,8 @@ def command_id(reader):
 
 TOPICS = (
     "alive pose cloud scan health load params event recorded/pose recorded/health recorded/odometry recorded/scan "
-    "recorded/truth map info clock cmd/params cmd/pose cmd/relocalize cmd/rates cmd/auto shadow link missing"
+    "recorded/truth map info clock cmd/params cmd/pose cmd/relocalize cmd/rates cmd/auto shadow link missing "
+    "files cmd/record"
 ).split()
 STATES = "init converging localized degraded lost relocalizing stale".split()
 CAUSES = (
@@ -117,6 +118,9 @@ cause = record(
 )
 set_ref = record(name=text, revision=u64)
 value = enum(("bool", boolean), ("int", i64), ("float", f64), ("text", text))
+recorder = record(
+    recording=boolean, file=u64, bytes=u64, limit=u64, free=u64, dropped=u64, error=option(text)
+)
 rates = record(pose=f32, cloud=f32, scan=f32, health=f32, recorded=boolean)
 METRICS = (
     "alignment residual short_beams long_beams no_return ess_ratio w_ratio spread_along spread_across second_mode slip "
@@ -176,6 +180,8 @@ event_kind = enum(
     ("shadow_dropped", record(set=text, evidence=text)),
     ("rates_lowered", record(transit=f32, pose=f32, recorded=boolean)),
     "rates_restored",
+    ("recording_started", record(file=u64)),
+    ("recording_ended", record(reason=text)),
 )
 EVENT = Message(
     "event", 7, {3},
@@ -205,6 +211,7 @@ outcome = enum(
                 ("sets", several(record(set=parameter_set, built_in=boolean, who=option(text)))),
                 ("candidates", several(record(number=u32, pose=pose2, score=f32))),
                 ("rates", rates),
+                ("recorder", recorder),
             ),
         ),
     ),

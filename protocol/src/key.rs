@@ -111,11 +111,15 @@ pub enum Topic {
     Link,
     /// Query with a [`MissingRequest`](crate::MissingRequest), answered with a [`MissingReply`](crate::MissingReply).
     Missing,
+    /// Query with a [`FilesRequest`](crate::FilesRequest), answered with a [`FilesReply`](crate::FilesReply).
+    Files,
+    /// [`Command`](crate::Command) about the recording on the car.
+    CmdRecord,
 }
 
 impl Topic {
     /// The key table.
-    const TABLE: [(Self, &'static str); 24] = [
+    const TABLE: [(Self, &'static str); 26] = [
         (Self::Alive, "alive"),
         (Self::Pose, "pose"),
         (Self::Cloud, "cloud"),
@@ -140,6 +144,8 @@ impl Topic {
         (Self::Shadow, "shadow"),
         (Self::Link, "link"),
         (Self::Missing, "missing"),
+        (Self::Files, "files"),
+        (Self::CmdRecord, "cmd/record"),
     ];
 
     /// Every topic.
@@ -205,6 +211,8 @@ pub struct Key {
 }
 
 impl Key {
+    /// The message encoding of an MCAP channel whose topic is a key and whose messages are as on the wire.
+    pub const RECORDED_ENCODING: &str = "synpf-v1";
     /// The first two parts of every key.
     pub const PREFIX: &'static str = "synpf/v1";
 

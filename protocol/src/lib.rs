@@ -5,8 +5,8 @@
 //!
 //! ```text
 //! car  --- pose, cloud, scan, health, load, params, shadow, event, recorded/* -->  pit wall   (telemetry)
-//! car  <-- map?, info?, clock?, missing? ----------------------------------------  pit wall   (queries)
-//! car  <-- cmd/params, cmd/pose, cmd/relocalize, cmd/rates, cmd/auto ------------  pit wall   (commands)
+//! car  <-- map?, info?, clock?, missing?, files? ------------------------------------  pit wall   (queries)
+//! car  <-- cmd/params, cmd/pose, cmd/relocalize, cmd/rates, cmd/auto, cmd/record  pit wall   (commands)
 //!      --- answer: done at update N | refused | stale revision ----------------->
 //! car  <-- link (how late its poses arrive) -------------------------------------  pit wall   (link report)
 //! ```
@@ -54,12 +54,13 @@ pub use key::{CarName, Key, KeyError, Topic};
 pub use message::{Invalid, Message, Schema};
 pub use telemetry::Telemetry;
 pub use to_car::{
-    Action, Answer, Candidate, Command, CommandId, IdError, Kept, LinkReport, MissingReply, MissingRequest,
-    Outcome, ParamsAction, Rates, RatesAction, RelocalizeAction, Reply, Resent, StoredSet, Wanted,
+    Action, Answer, Candidate, Command, CommandId, FileInfo, FileName, FileNameError, FilesReply,
+    FilesRequest, IdError, Kept, LinkReport, MissingReply, MissingRequest, Outcome, ParamsAction, Rates,
+    RatesAction, RecordAction, RelocalizeAction, Reply, Resent, StoredSet, Wanted,
 };
 pub use to_wall::{
     CarInfo, Cause, CauseKind, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Comparison, Drops,
     EndPoint, EndPointKind, Event, EventKind, Fitness, Health, Latency, Load, MapRaceline, MapReply, Metrics,
-    ParameterSet, Params, PendingRevert, Pose, PoseKind, Proposal, RecordedOdometry, RecordedScan, ScanView,
-    SetRef, Severity, Shadow, State, TrackPoint, Truth, Value, ValueChange,
+    ParameterSet, Params, PendingRevert, Pose, PoseKind, Proposal, RecordedOdometry, RecordedScan,
+    RecorderState, ScanView, SetRef, Severity, Shadow, State, TrackPoint, Truth, Value, ValueChange,
 };

@@ -124,4 +124,8 @@ schemas! {
     MissingRequest = 19,
     /// [`MissingReply`](crate::MissingReply)
     MissingReply = 20,
+    /// [`FilesRequest`](crate::FilesRequest)
+    FilesRequest = 21,
+    /// [`FilesReply`](crate::FilesReply)
+    FilesReply = 22,
 }

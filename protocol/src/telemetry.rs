@@ -63,7 +63,9 @@ impl Telemetry {
             | Topic::CmdRates
             | Topic::CmdAuto
             | Topic::Link
-            | Topic::Missing => return None,
+            | Topic::Missing
+            | Topic::Files
+            | Topic::CmdRecord => return None,
         })
     }
 }

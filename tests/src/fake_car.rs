@@ -373,6 +373,7 @@ fn load() -> Load {
         scan_jitter: 0.001,
         queue_depth: 0,
         drops: Drops::default(),
+        recorder: None,
     }
 }
 

@@ -203,6 +203,7 @@ fn entry_of(event: &Event, car: &CarName, at: i64) -> LogEntry {
         EventKind::SlipStarted { .. } | EventKind::SlipEnded { .. } => "slip",
         EventKind::Started { .. } | EventKind::Stopping { .. } | EventKind::SourceEnded => "node",
         EventKind::RatesChanged { .. } | EventKind::RatesLowered { .. } | EventKind::RatesRestored => "rates",
+        EventKind::RecordingStarted { .. } | EventKind::RecordingEnded { .. } => "recording",
         EventKind::CommandRefused { .. } => "refused",
         EventKind::Warning { .. } => "warning",
         EventKind::Error { .. } => "error",

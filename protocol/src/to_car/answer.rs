@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{CommandId, Message, ParameterSet, Pose2, Rates, Schema, SetRef};
+use crate::{CommandId, Message, ParameterSet, Pose2, Rates, RecorderState, Schema, SetRef};
 
 /// The answer to a command. If none arrives in time, the sender has to treat that as a fourth outcome.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -52,6 +52,8 @@ pub enum Reply {
     Candidates(Vec<Candidate>),
     /// The telemetry rates.
     Rates(Rates),
+    /// The recording on the car.
+    Recorder(RecorderState),
 }
 
 /// A set on a car.

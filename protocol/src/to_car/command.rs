@@ -40,6 +40,8 @@ pub enum Action {
     Rates(RatesAction),
     /// Under [`Topic::CmdAuto`]: turn automatic switching of sets on or off.
     Auto(bool),
+    /// Under [`Topic::CmdRecord`].
+    Record(RecordAction),
 }
 
 impl Action {
@@ -51,6 +53,7 @@ impl Action {
             Self::Relocalize(_) => Topic::CmdRelocalize,
             Self::Rates(_) => Topic::CmdRates,
             Self::Auto(_) => Topic::CmdAuto,
+            Self::Record(_) => Topic::CmdRecord,
         }
     }
 }
@@ -102,6 +105,18 @@ pub enum RelocalizeAction {
         /// Its [`Candidate::number`](crate::Candidate::number).
         candidate: u32,
     },
+}
+
+/// About the recording on the car.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecordAction {
+    /// Answer with the state.
+    Get,
+    /// Start to record; nothing changes while the car records.
+    Start,
+    /// Complete the file and stop; nothing changes while the car does not record.
+    Stop,
 }
 
 /// About telemetry rates.

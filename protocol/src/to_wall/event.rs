@@ -210,6 +210,16 @@ pub enum EventKind {
     },
     /// The link has recovered: the car sends what was requested.
     RatesRestored,
+    /// The car records on its own disk from here.
+    RecordingStarted {
+        /// Number of the first file.
+        file: u64,
+    },
+    /// The recording on the car has ended.
+    RecordingEnded {
+        /// Why.
+        reason: String,
+    },
 }
 
 impl EventKind {
@@ -317,6 +327,8 @@ impl fmt::Display for EventKind {
                 )
             }
             Self::RatesRestored => f.write_str("link recovered: requested rates again"),
+            Self::RecordingStarted { file } => write!(f, "recording on the car, from file {file}"),
+            Self::RecordingEnded { reason } => write!(f, "recording on the car ended: {reason}"),
         }
     }
 }

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Invalid, Message, Schema};
+use crate::codec::Payload;
+use crate::{CodecError, Invalid, Message, Schema};
 
 /// Load over the last second.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -39,6 +40,32 @@ pub struct Load {
     pub queue_depth: u32,
     /// Messages dropped since the node started.
     pub drops: Drops,
+    /// The recording on the car; None on a car without a folder for it.
+    pub recorder: Option<RecorderState>,
+}
+
+/// State of the recording on the car.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct RecorderState {
+    /// True while the car records. It may fail for a while: see [`RecorderState::error`].
+    pub recording: bool,
+    /// Number of the file being written; 0 when there is none.
+    pub file: u64,
+    /// Size of all recordings on the car \[bytes\].
+    pub bytes: u64,
+    /// Most that they may have; then the oldest are deleted \[bytes\].
+    pub limit: u64,
+    /// Free space on their disk \[bytes\].
+    pub free: u64,
+    /// Messages not recorded since the node started, because the disk or the CPU was too slow.
+    pub dropped: u64,
+    /// Why nothing can be written at present; None when all is well.
+    pub error: Option<String>,
+}
+
+impl RecorderState {
+    /// Longest error \[bytes\].
+    pub const MAX_ERROR: usize = 300;
 }
 
 impl Load {
@@ -104,9 +131,66 @@ impl Drops {
 
 impl Message for Load {
     const SCHEMA: Schema = Schema::Load;
+    const VERSION: u16 = 2;
     const MAX_LEN: usize = 4096;
 
+    fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
+        (version == 1).then(|| payload.read::<LoadV1>().map(Self::from))
+    }
+
     fn validate(&self) -> Result<(), Invalid> {
+        if let Some(error) = self
+            .recorder
+            .as_ref()
+            .and_then(|recorder| recorder.error.as_ref())
+        {
+            Invalid::unless_at_most("error", error.len(), RecorderState::MAX_ERROR)?;
+        }
         Invalid::unless_at_most("cpu_cores", self.cpu_cores.len(), Self::MAX_CORES)
+    }
+}
+
+/// Version 1, which never changes.
+#[derive(Deserialize)]
+struct LoadV1 {
+    cpu_process: f32,
+    cpu_cores: Vec<f32>,
+    memory_process: u64,
+    memory_used: u64,
+    memory_total: u64,
+    temperature: Option<f32>,
+    throttled: Option<bool>,
+    update_us: Latency,
+    scan_age_us: Latency,
+    publish_lag_us: Latency,
+    scan_rate: f32,
+    odometry_rate: f32,
+    update_rate: f32,
+    scan_jitter: f32,
+    queue_depth: u32,
+    drops: Drops,
+}
+
+impl From<LoadV1> for Load {
+    fn from(older: LoadV1) -> Self {
+        Self {
+            cpu_process: older.cpu_process,
+            cpu_cores: older.cpu_cores,
+            memory_process: older.memory_process,
+            memory_used: older.memory_used,
+            memory_total: older.memory_total,
+            temperature: older.temperature,
+            throttled: older.throttled,
+            update_us: older.update_us,
+            scan_age_us: older.scan_age_us,
+            publish_lag_us: older.publish_lag_us,
+            scan_rate: older.scan_rate,
+            odometry_rate: older.odometry_rate,
+            update_rate: older.update_rate,
+            scan_jitter: older.scan_jitter,
+            queue_depth: older.queue_depth,
+            drops: older.drops,
+            recorder: None,
+        }
     }
 }

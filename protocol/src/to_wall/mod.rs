@@ -17,7 +17,7 @@ pub use cloud::{Cloud, CloudParticle};
 pub use event::{Event, EventKind, SetRef, ValueChange};
 pub use health::{Cause, CauseKind, Health, Metrics, Proposal, Severity, State};
 pub use info::{CarInfo, ClockReply, ClockRequest};
-pub use load::{Drops, Latency, Load};
+pub use load::{Drops, Latency, Load, RecorderState};
 pub use map::{Cell, MapRaceline, MapReply};
 pub(crate) use params::set_name;
 pub use params::{ParameterSet, Params, PendingRevert, Value};

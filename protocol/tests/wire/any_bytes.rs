@@ -3,9 +3,10 @@
 //! Shared by the tests here and by the fuzz target, which looks where the dice do not fall.
 
 use protocol::{
-    Answer, CarInfo, ClockReply, ClockRequest, Cloud, Command, Event, Header, Health, Key, LinkReport, Load,
-    MapReply, Message, MissingReply, MissingRequest, Params, Pose, RecordedOdometry, RecordedScan, ScanView,
-    Schema, Shadow, Stamps, Telemetry, Topic, Truth, decode, encode,
+    Answer, CarInfo, ClockReply, ClockRequest, Cloud, Command, Event, FilesReply, FilesRequest, Header,
+    Health, Key, LinkReport, Load, MapReply, Message, MissingReply, MissingRequest, Params, Pose,
+    RecordedOdometry, RecordedScan, ScanView, Schema, Shadow, Stamps, Telemetry, Topic, Truth, decode,
+    encode,
 };
 
 /// Checks that nothing but good comes of `data`.
@@ -52,6 +53,8 @@ fn as_everything(bytes: &[u8]) {
     there_and_back::<LinkReport>(bytes);
     there_and_back::<MissingRequest>(bytes);
     there_and_back::<MissingReply>(bytes);
+    there_and_back::<FilesRequest>(bytes);
+    there_and_back::<FilesReply>(bytes);
 }
 
 fn there_and_back<M: Message>(bytes: &[u8]) {

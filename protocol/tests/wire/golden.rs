@@ -45,7 +45,7 @@ fn header() {
 #[test]
 fn schemas_keep_their_numbers() {
     let ids: Vec<_> = Schema::ALL.iter().map(|&schema| schema as u16).collect();
-    assert_eq!(ids, (1..=20).collect::<Vec<_>>());
+    assert_eq!(ids, (1..=22).collect::<Vec<_>>());
     assert_eq!(Schema::from_id(7), Some(Schema::Event));
     assert_eq!(Schema::from_id(0), None);
 }
@@ -69,7 +69,7 @@ fn topics_keep_their_numbers() {
             u32::from_le_bytes(*tag)
         })
         .collect();
-    assert_eq!(tags, (0..24).collect::<Vec<_>>());
+    assert_eq!(tags, (0..26).collect::<Vec<_>>());
 }
 
 #[test]
@@ -86,17 +86,20 @@ fn variants_keep_their_numbers() {
     assert_eq!(tags(samples::STATES.map(samples::health), 0), count(7));
     assert_eq!(
         tags(samples::event_kinds().into_iter().map(samples::event), 0),
-        count(26)
+        count(28)
     );
     // A command: id 16, operator 8 + 3, revision 1 + 8.
     let commands = || samples::actions().into_iter().map(samples::command);
-    assert_eq!(tags(commands(), 36), [0, 0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4, 0]);
-    let about_sets = commands().take(6).chain(commands().skip(12));
+    assert_eq!(
+        tags(commands(), 36),
+        [0, 0, 0, 0, 0, 0, 1, 2, 2, 3, 3, 4, 0, 5, 5, 5]
+    );
+    let about_sets = commands().take(6).chain(commands().skip(12).take(1));
     assert_eq!(tags(about_sets, 40), count(7));
     // An answer: id 16, the outcome, and for Done the update 1 + 8.
     let answers = || samples::outcomes().into_iter().map(samples::answer);
-    assert_eq!(tags(answers(), 16), [0, 0, 0, 0, 1, 2]);
-    assert_eq!(tags(answers().take(4), 29), count(4));
+    assert_eq!(tags(answers(), 16), [0, 0, 0, 0, 0, 1, 2]);
+    assert_eq!(tags(answers().take(5), 29), count(5));
 }
 
 /// The payload that `golden.txt` has under `name`.
@@ -133,6 +136,15 @@ fn health_of_version_1_is_read() {
         "version 1 knows all but this"
     );
     assert_eq!(older::<Health>(1, golden("health of version 1")), expected);
+}
+
+#[test]
+fn load_of_version_1_is_read() {
+    let expected = Load {
+        recorder: None,
+        ..samples::load()
+    };
+    assert_eq!(older::<Load>(1, golden("load of version 1")), expected);
 }
 
 /// Events as cars of versions 1 and 2 have sent them.
@@ -221,4 +233,9 @@ payloads! {
     missing_request: samples::missing_request();
     missing_reply: samples::missing_reply();
     answer: samples::answer(samples::outcomes().swap_remove(1));
+    files_read: samples::files_requests()[1];
+    files_list: samples::files_replies()[0];
+    files_checksum: samples::files_replies()[2];
+    record_command: samples::command(samples::actions().swap_remove(14));
+    recorder_answer: samples::answer(samples::outcomes().swap_remove(4));
 }

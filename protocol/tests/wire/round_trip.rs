@@ -97,6 +97,12 @@ fn every_kind_of_message_comes_back() {
     check(&samples::shadow());
     check(&samples::map());
     check(&samples::info());
+    for request in samples::files_requests() {
+        check(&request);
+    }
+    for reply in samples::files_replies() {
+        check(&reply);
+    }
     check(&Truth {
         pose: samples::POSE,
         twist: samples::TWIST,

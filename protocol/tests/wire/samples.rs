@@ -188,7 +188,62 @@ pub(crate) fn load() -> Load {
             telemetry: 8,
             payloads: 9,
         },
+        recorder: Some(recorder()),
     }
+}
+
+pub(crate) fn recorder() -> RecorderState {
+    RecorderState {
+        recording: true,
+        file: 12,
+        bytes: 1 << 26,
+        limit: 1 << 33,
+        free: 1 << 34,
+        dropped: 3,
+        error: Some("full".into()),
+    }
+}
+
+/// One of each kind, in the order of the wire.
+pub(crate) fn files_requests() -> [FilesRequest; 3] {
+    [
+        FilesRequest::List { after: 11 },
+        FilesRequest::Read {
+            number: 12,
+            offset: 65_536,
+            length: 4000,
+        },
+        FilesRequest::Checksum {
+            number: 12,
+            length: 69_536,
+        },
+    ]
+}
+
+/// One of each kind, in the order of the wire.
+pub(crate) fn files_replies() -> [FilesReply; 4] {
+    [
+        FilesReply::Files {
+            files: vec![FileInfo {
+                number: 12,
+                started: 1_000,
+                bytes: 69_536,
+                finished: true,
+            }],
+            more: false,
+        },
+        FilesReply::Bytes {
+            number: 12,
+            offset: 65_536,
+            bytes: vec![1, 2, 3],
+        },
+        FilesReply::Checksum {
+            number: 12,
+            length: 69_536,
+            xxh3: 0x0102_0304_0506_0708,
+        },
+        FilesReply::Refused { fault: "gone".into() },
+    ]
 }
 
 pub(crate) fn parameter_set() -> ParameterSet {
@@ -342,6 +397,10 @@ pub(crate) fn event_kinds() -> Vec<EventKind> {
             recorded: false,
         },
         EventKind::RatesRestored,
+        EventKind::RecordingStarted { file: 12 },
+        EventKind::RecordingEnded {
+            reason: "stopped".into(),
+        },
     ]
 }
 
@@ -423,6 +482,9 @@ pub(crate) fn actions() -> Vec<Action> {
         Action::Params(ParamsAction::Shadow {
             name: Some("lq".into()),
         }),
+        Action::Record(RecordAction::Get),
+        Action::Record(RecordAction::Start),
+        Action::Record(RecordAction::Stop),
     ]
 }
 
@@ -457,6 +519,7 @@ pub(crate) fn outcomes() -> Vec<Outcome> {
             score: 0.75,
         }])),
         done(Reply::Rates(rates)),
+        done(Reply::Recorder(recorder())),
         Outcome::Refused {
             faults: vec!["so".into()],
         },
@@ -503,6 +566,8 @@ pub(crate) fn all() -> Vec<Vec<u8>> {
         bytes(&missing_request()),
         bytes(&missing_reply()),
     ];
+    all.extend(files_requests().iter().map(bytes));
+    all.extend(files_replies().iter().map(bytes));
     all.extend(event_kinds().into_iter().map(|kind| bytes(&event(kind))));
     all.extend(actions().into_iter().map(|action| bytes(&command(action))));
     all.extend(outcomes().into_iter().map(|outcome| bytes(&answer(outcome))));

@@ -130,7 +130,11 @@ impl CommandHandler {
     fn execute(&mut self, command: &Command, payload_hash: PayloadHash) -> Answer {
         let mut outcome = match &command.action {
             Action::Params(action) => self.apply_params(command, action),
-            Action::Pose(_) | Action::Relocalize(_) | Action::Rates(_) | Action::Auto(_)
+            Action::Pose(_)
+            | Action::Relocalize(_)
+            | Action::Rates(_)
+            | Action::Auto(_)
+            | Action::Record(_)
                 if command
                     .expected_revision
                     .is_some_and(|expected| expected != self.config.store.reference().revision) =>
@@ -141,6 +145,7 @@ impl CommandHandler {
             Action::Relocalize(action) => self.relocalize(command, *action),
             Action::Rates(action) => self.apply_rates(command, action),
             Action::Auto(on) => self.set_auto(command, *on),
+            Action::Record(_) => refused("this car has no folder for recordings".into()),
         };
         if let Outcome::Refused { faults } = &mut outcome {
             faults.iter_mut().for_each(shorten);

@@ -100,9 +100,9 @@ pub(crate) struct Run {
     /// the map [default: truth for the simulator, else global].
     #[arg(long, value_name = "X,Y,HEADING|truth|global", value_parser = start_or_global, allow_hyphen_values = true)]
     pub(crate) initial_pose: Option<Start>,
-    /// The car's name on the network.
-    #[arg(long, value_name = "NAME", default_value = "car-1")]
-    pub(crate) car: CarName,
+    /// The car's name on the network. Two cars must not have the same [default: car-1; none with --source ros2].
+    #[arg(long, alias = "name", value_name = "NAME", required_if_eq("source", "ros2"))]
+    pub(crate) car: Option<CarName>,
     /// Play a bag this many times as fast, 0.01 to 1000.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = rate)]
     pub(crate) rate: f64,

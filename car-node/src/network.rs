@@ -130,17 +130,27 @@ pub fn close(session: &Session, patience: Duration) {
     }
 }
 
-/// Declares the car as alive, until the token is dropped.
-pub fn declare_alive(session: &Session, car: &CarName) -> Result<LivelinessToken, NetworkError> {
-    let key = Key::new(car.clone(), Topic::Alive).to_string();
-    session
-        .liveliness()
-        .declare_token(&key)
-        .wait()
-        .map_err(|error| NetworkError::Declare {
-            key,
-            reason: error.to_string(),
-        })
+/// Declares the car and its run as alive, until the tokens are dropped.
+pub fn declare_alive(
+    session: &Session,
+    car: &CarName,
+    run_id: u64,
+) -> Result<[LivelinessToken; 2], NetworkError> {
+    let declare = |key: String| {
+        session
+            .liveliness()
+            .declare_token(&key)
+            .wait()
+            .map_err(|error| NetworkError::Declare {
+                key,
+                reason: error.to_string(),
+            })
+    };
+    Ok([
+        // The run first: whoever sees the car then knows its run.
+        declare(Key::run_token(car, run_id))?,
+        declare(Key::new(car.clone(), Topic::Alive).to_string())?,
+    ])
 }
 
 /// Declares the publisher of a topic. It drops what the link cannot take, and never blocks.

@@ -1,8 +1,10 @@
 //! The events that reach the pit wall. The fleet, the recorder and a replay share them.
 
+use std::fmt;
 use std::sync::Arc;
 
 use protocol::{CarInfo, CarName, Header, MapReply, Telemetry, Topic};
+use serde::{Deserialize, Serialize};
 
 /// Receives every event. It runs in the decoder's thread or in one of zenoh's, so it must not wait.
 pub type EventSink = Arc<dyn Fn(FleetEvent) + Send + Sync>;
@@ -47,6 +49,19 @@ pub enum EventPayload {
         /// Why it cannot be decoded.
         error: String,
     },
+    /// Messages that were dropped because their run or their number is not plausible. They are not in the counts of a stream.
+    Rejected {
+        /// Their topic.
+        topic: Topic,
+        /// Run id of the last of them.
+        run_id: u64,
+        /// Sequence number of the last of them.
+        sequence: u64,
+        /// How many.
+        count: u64,
+        /// Why.
+        reason: Rejection,
+    },
     /// The car's map was fetched.
     Map {
         /// The map.
@@ -79,6 +94,28 @@ pub enum EventPayload {
         /// The messages that have not arrived yet.
         outstanding: Vec<SentRange>,
     },
+}
+
+/// Why messages are dropped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rejection {
+    /// Two cars of this name send at once.
+    TwoSenders,
+    /// They are of another run than the one that is followed.
+    OtherRun,
+    /// Their number is far from the others of the stream.
+    Leap,
+}
+
+impl fmt::Display for Rejection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::TwoSenders => "two cars of this name send at once; only the first is shown and recorded",
+            Self::OtherRun => "another run of the car than the one that is followed",
+            Self::Leap => "a sequence number that is far from the others",
+        })
+    }
 }
 
 /// Sequence numbers of a stream that were sent and have not been released yet.

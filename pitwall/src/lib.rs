@@ -58,7 +58,7 @@ mod web;
 #[cfg(feature = "rerun")]
 pub use crate::rerun::{RerunError, RerunOutlet, RerunView};
 pub use clock::unix_now;
-pub use event::{Delivery, EventPayload, EventSink, FleetEvent, SentRange};
+pub use event::{Delivery, EventPayload, EventSink, FleetEvent, Rejection, SentRange};
 pub use event_bus::{EventBus, FleetGuard};
 pub use fleet::{
     Car, CarView, Fleet, GapSummary, HealthSample, Lap, LapGrip, Log, LogEntry, PoseView, ProfileCell,

@@ -82,11 +82,6 @@ impl<L: Copy + PartialEq> NumberRanges<L> {
         Some([from, to])
     }
 
-    /// Removes all numbers.
-    pub(crate) fn clear(&mut self) {
-        self.ranges.clear();
-    }
-
     /// True when there is no number in the set.
     pub(crate) fn is_empty(&self) -> bool {
         self.ranges.is_empty()

@@ -14,8 +14,9 @@ use crate::Schema;
 /// What a sender adds to the content of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Stamps {
-    /// Identifies a run: the life of one sending process. It is the unix time of the process's start \[ns\].
-    /// Sequence numbers start again at 1 with each run.
+    /// Identifies a run: the life of one sending process. Sequence numbers start again at 1 with each run. A car chooses the
+    /// unix time of its start \[ns\], or one more than its last run's where its clock is behind. Receivers compare it for
+    /// equality only: a higher number is no proof of a later run.
     pub run_id: u64,
     /// Number of the message within the run and its key, from 1. It is 0 for queries and commands, which are not counted.
     pub sequence: u64,

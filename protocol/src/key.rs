@@ -220,6 +220,23 @@ impl Key {
     pub fn new(car: CarName, topic: Topic) -> Self {
         Self { car, topic }
     }
+
+    /// The liveliness token of one run of a car, beside [`Topic::Alive`]. Two of them at once are two senders of one name.
+    pub fn run_token(car: &CarName, run_id: u64) -> String {
+        format!("{}/{car}/{}/{run_id}", Self::PREFIX, Topic::Alive)
+    }
+
+    /// The key expression of the run tokens of all cars.
+    pub fn run_tokens_of_all_cars() -> String {
+        format!("{}/*", Topic::Alive.of_all_cars())
+    }
+
+    /// The car and the run of a run token; None for another key.
+    pub fn parse_run_token(key: &str) -> Option<(CarName, u64)> {
+        let (alive, run_id) = key.rsplit_once('/')?;
+        let key: Self = alive.parse().ok()?;
+        (key.topic == Topic::Alive).then_some((key.car, run_id.parse().ok()?))
+    }
 }
 
 impl fmt::Display for Key {
@@ -283,7 +300,16 @@ mod tests {
         }
 
         #[test]
+        fn a_run_token_has_its_car_and_run(name in "[a-z0-9-]{1,32}", run_id: u64) {
+            let car = CarName::new(name).expect("a good name");
+            let token = Key::run_token(&car, run_id);
+            prop_assert_eq!(Key::parse_run_token(&token), Some((car.clone(), run_id)));
+            prop_assert_eq!(Key::parse_run_token(&Key::new(car, Topic::Alive).to_string()), None);
+        }
+
+        #[test]
         fn no_text_panics(text in ".*") {
+            prop_assert_eq!(Key::parse_run_token(&text), None);
             if let Ok(key) = text.parse::<Key>() {
                 prop_assert_eq!(key.to_string(), text);
             }

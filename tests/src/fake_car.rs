@@ -33,6 +33,10 @@ pub struct Behaviour {
     pub newer_health: bool,
     /// It sends messages of the full-rate streams only on request, as a car does over a slow link.
     pub withholds_recorded: bool,
+    /// Its run; by default the time of its start.
+    pub run_id: Option<u64>,
+    /// It is of a version without liveliness tokens of runs.
+    pub without_run_token: bool,
     /// Its distance behind the other cars on the lap, in updates of 25 ms.
     pub updates_behind: u64,
 }
@@ -87,6 +91,7 @@ impl FakeCar {
     pub async fn start(name: &str, endpoint: &str, behaviour: Behaviour) -> Self {
         let name = CarName::new(name).expect("a good name");
         let session = zenoh::open(config(endpoint)).await.expect("a session");
+        let run_id = behaviour.run_id.unwrap_or_else(|| unix_now() as u64);
         let state = Arc::new(Mutex::new(CarState {
             published: BTreeMap::new(),
             archive: ReplayBuffer::default(),
@@ -95,10 +100,10 @@ impl FakeCar {
                 revision: 1,
             },
             who: "start".into(),
-            run_id: unix_now() as u64,
+            run_id,
         }));
         let running = Arc::new(AtomicBool::new(true));
-        let topics = Topics::declare(&session, &name, behaviour).await;
+        let topics = Topics::declare(&session, &name, run_id, behaviour).await;
         declare_queryables(&session, &name, &state, behaviour).await;
         let driver = tokio::spawn(drive(topics, state.clone(), running.clone(), behaviour));
         Self {
@@ -173,23 +178,29 @@ struct Topics {
     name: CarName,
     withholds_recorded: bool,
     newer_health: bool,
-    _alive: zenoh::liveliness::LivelinessToken,
+    _alive: Vec<zenoh::liveliness::LivelinessToken>,
 }
 
 impl Topics {
-    async fn declare(session: &Session, name: &CarName, behaviour: Behaviour) -> Self {
+    async fn declare(session: &Session, name: &CarName, run_id: u64, behaviour: Behaviour) -> Self {
         let key = |topic| Key::new(name.clone(), topic).to_string();
         let alive = session
             .liveliness()
             .declare_token(key(Topic::Alive))
             .await
             .expect("a token");
+        let mut tokens = vec![alive];
+        if !behaviour.without_run_token {
+            let token = Key::run_token(name, run_id);
+            let token = session.liveliness().declare_token(token).await;
+            tokens.push(token.expect("a token"));
+        }
         Self {
             session: session.clone(),
             name: name.clone(),
             withholds_recorded: behaviour.withholds_recorded,
             newer_health: behaviour.newer_health,
-            _alive: alive,
+            _alive: tokens,
         }
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use pitwall::{FleetService, Report, Verdict, read_events, unix_now};
-use protocol::{CarName, Outcome, Topic};
+use protocol::{CarName, Health, Key, Outcome, Stamps, State, Topic, encode};
 use system_tests::{
     Behaviour, DEADLINE, FakeCar, client, free_endpoint, in_force, named, recording, router, select,
     send_command, wait_until,
@@ -355,4 +355,142 @@ async fn a_recording_that_was_cut_off_is_recovered() {
         pitwall::recover(&torn, &mended).is_err(),
         "nothing is overwritten"
     );
+}
+
+// After a power cut, a car without a clock battery once stayed "LOCALIZED, alive" on its old run, and nothing of the new run was
+// recorded.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_car_that_restarts_with_its_clock_behind_is_shown_and_recorded() {
+    for without_run_token in [false, true] {
+        let (endpoint, service, _folder, _file) = recording().await;
+        let behaviour = |run_id| Behaviour {
+            run_id: Some(run_id),
+            without_run_token,
+            ..Behaviour::default()
+        };
+        let name = named("car-1");
+        let run = || {
+            let fleet = service.fleet();
+            let (header, pose) = fleet.car(&name)?.pose?;
+            (pose.update > 40).then_some(header.run_id)
+        };
+        let mut car = FakeCar::start("car-1", &endpoint, behaviour(5_000_000_000)).await;
+        wait_until("the first run", || run() == Some(5_000_000_000)).await;
+        let first = car.stop_driving().await;
+        wait_until("all of the first run", || received(&service, &first)).await;
+        car.leave().await;
+        let mut car = FakeCar::start("car-1", &endpoint, behaviour(7)).await;
+        wait_until("the second run", || run() == Some(7)).await;
+        let second = car.stop_driving().await;
+        wait_until("all of the second run", || received(&service, &second)).await;
+        let summary = service
+            .stop_recording()
+            .await
+            .expect("a recording")
+            .expect("good");
+        for stream in summary.streams.iter().filter(|stream| stream.topic.recovered()) {
+            assert_eq!((stream.gaps.missing, stream.rejected), (0, 0), "{summary}");
+            let sent = first[&stream.topic] + second[&stream.topic];
+            assert_eq!(stream.gaps.received, sent, "{summary}");
+        }
+        service.close().await;
+    }
+}
+
+/// True when the recorder has the last message of each recovered topic.
+fn received(service: &FleetService, published: &BTreeMap<Topic, u64>) -> bool {
+    let status = service.recording().expect("a recording");
+    let streams = &status.summary.streams;
+    published
+        .iter()
+        .filter(|(topic, _)| topic.recovered())
+        .all(|(topic, last)| {
+            streams
+                .iter()
+                .any(|s| s.topic == *topic && s.gaps.last == *last && s.gaps.missing == 0)
+        })
+}
+
+// One header with session 2^64-1, or a number far ahead, once stopped a car until the pit wall was restarted.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_forged_header_stops_no_car() {
+    let endpoint = free_endpoint();
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    let newest = || service.fleet().car(car.name())?.health.as_ref().map(|h| h.update);
+    wait_until("health messages", || newest().is_some_and(|update| update > 20)).await;
+    let run_id = service
+        .fleet()
+        .car(car.name())
+        .and_then(|car| Some(car.pose?.0.run_id));
+    let health = Health {
+        state: State::Lost,
+        since: 0,
+        causes: Vec::new(),
+        update: 1,
+        metrics: None,
+        proposal: None,
+        auto: false,
+    };
+    let forger = zenoh::open(forger(&endpoint)).await.expect("a session");
+    for (run_id, sequence) in [
+        (u64::MAX, 1),
+        (run_id.expect("known"), u64::MAX),
+        (run_id.expect("known"), 1 << 40),
+    ] {
+        let stamps = Stamps {
+            run_id,
+            sequence,
+            ..Stamps::default()
+        };
+        let bytes = encode(&health, stamps).expect("a good message");
+        let key = Key::new(car.name().clone(), Topic::Health).to_string();
+        forger.put(key, bytes).await.expect("sent");
+    }
+    let rejected = || {
+        let fleet = service.fleet();
+        let view = fleet.car(car.name()).map(|car| car.view(unix_now()));
+        view.map_or(0, |view| view.streams["health"].rejected)
+    };
+    wait_until("they are counted", || rejected() == 3).await;
+    let before = newest().expect("known");
+    wait_until("the car goes on", || {
+        newest().is_some_and(|update| update > before + 20)
+    })
+    .await;
+    let view = service.fleet().car(car.name()).map(|car| car.view(unix_now()));
+    assert_eq!(view.expect("there").state, "LOCALIZED");
+    forger.close().await.expect("closed");
+    service.close().await;
+}
+
+fn forger(endpoint: &str) -> zenoh::Config {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", r#""client""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        config.insert_json5(key, &value).expect("a good setting");
+    }
+    config
+}
+
+// Two cars of one name were once mixed up without a word.
+#[tokio::test(flavor = "multi_thread")]
+async fn two_cars_of_one_name_are_an_alarm() {
+    let endpoint = free_endpoint();
+    let service = FleetService::open(&router(&endpoint)).await.expect("a link");
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    assert!(service.wait_for(car.name(), DEADLINE).await);
+    let view = || service.fleet().car(car.name()).map(|car| car.view(unix_now()));
+    let alarmed = || view().is_some_and(|view| view.causes.iter().any(|cause| cause.starts_with("two cars")));
+    wait_until("its pose", || view().is_some_and(|view| view.pose.is_some())).await;
+    assert!(!alarmed());
+    let other = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    wait_until("the alarm", alarmed).await;
+    other.leave().await;
+    wait_until("the end of the alarm", || !alarmed()).await;
+    assert_eq!(service.fleet().log().alarms(), 1);
+    service.close().await;
 }

@@ -13,6 +13,7 @@ use car_node::sensors::frames::Mount;
 use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
+use protocol::CarName;
 use simulator::{CarSetup, Grip, OdometryParams, YawSource};
 use synpf::{TablePolicy, TrackMap};
 
@@ -21,7 +22,11 @@ use crate::cli::{Odometry, Run, SourceKind};
 /// Time after the last message of a bag for the pit wall to recover gaps.
 const LINGER: Duration = Duration::from_secs(1);
 
+/// The name of a car that is simulated or comes from a bag.
+const DEFAULT_NAME: &str = "car-1";
+
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
+    let car = name(arguments)?;
     let signal = signals()?;
     let mut pose_sink = None;
     let (map, source, start): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
@@ -40,7 +45,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             }
             // The map first, so that its faults show without ROS.
             let map = map_file(arguments)?;
-            let source = ros2(arguments, &signal)?;
+            let source = ros2(arguments, &car, &signal)?;
             pose_sink = pose_for_ros(arguments, &source)?;
             (map, Box::new(source), Start::Global)
         }
@@ -57,7 +62,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         }
     };
     let description = source.description();
-    let mut config = NodeConfig::new(arguments.car.clone(), map, source);
+    let mut config = NodeConfig::new(car.clone(), map, source);
     config.set = arguments.params.as_deref().map(super::load_set).transpose()?;
     config.start = arguments.initial_pose.unwrap_or(start);
     config.seed = arguments.seed;
@@ -69,35 +74,39 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     config.state = arguments
         .state
         .clone()
-        .or_else(|| default_state_folder(arguments.car.as_str()));
+        .or_else(|| default_state_folder(car.as_str()));
     let node = Node::start(config)?;
     let wall = if arguments.connect.is_empty() {
         "a pit wall on this machine or nearby".to_owned()
     } else {
         arguments.connect.join(", ")
     };
-    eprintln!(
-        "{}: {description}; connects to {wall}. Ctrl-C ends it.",
-        arguments.car
-    );
+    eprintln!("{car}: {description}; connects to {wall}. Ctrl-C ends it.");
     let reason = wait(&node, &signal, arguments.stay);
     let estimate = node.shared().latest_pose();
     node.shutdown(reason);
     match estimate {
         Some(estimate) => eprintln!(
-            "{}: {reason}; last pose {:.2}, {:.2} m, {:.1} deg.",
-            arguments.car,
+            "{car}: {reason}; last pose {:.2}, {:.2} m, {:.1} deg.",
             estimate.pose.x,
             estimate.pose.y,
             estimate.pose.heading.to_degrees()
         ),
-        None => eprintln!("{}: {reason}; there was no pose.", arguments.car),
+        None => eprintln!("{car}: {reason}; there was no pose."),
     }
     Ok(())
 }
 
+/// The car's name. A real car has no default: two of them would have the same.
+fn name(arguments: &Run) -> anyhow::Result<CarName> {
+    match &arguments.car {
+        Some(car) => Ok(car.clone()),
+        None => Ok(CarName::new(DEFAULT_NAME)?),
+    }
+}
+
 /// Finds the live sensors. Prints what is missing while it waits.
-fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2> {
+fn ros2(arguments: &Run, car: &CarName, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2> {
     let domain = match (arguments.ros_domain, env::var("ROS_DOMAIN_ID")) {
         (Some(domain), _) => domain,
         (None, Ok(text)) if !text.is_empty() => text
@@ -117,10 +126,7 @@ fn ros2(arguments: &Run, signal: &Receiver<&'static str>) -> anyhow::Result<Ros2
     let source = Ros2::find(&options, |missing| {
         if missing != printed {
             missing.clone_into(&mut printed);
-            eprintln!(
-                "{}: waiting for ROS 2 (domain {domain}): {missing}",
-                arguments.car
-            );
+            eprintln!("{car}: waiting for ROS 2 (domain {domain}): {missing}");
         }
         signal.try_recv().is_err()
     })?;

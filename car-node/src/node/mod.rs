@@ -6,7 +6,9 @@
 //!              command server <=============== commands ==============+
 //! ```
 
+mod namesake;
 mod queryables;
+mod run_id;
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
@@ -154,7 +156,8 @@ pub struct Node {
     publisher: JoinHandle<()>,
     queryables: Vec<Queryable<()>>,
     link_reports: Subscriber<()>,
-    alive: LivelinessToken,
+    namesakes: Subscriber<()>,
+    alive: [LivelinessToken; 2],
 }
 
 /// Closing the zenoh session on a dead link takes long; the node waits this long at most.
@@ -187,7 +190,7 @@ impl Node {
         if !(rate.is_finite() && rate > 0.0) {
             return Err(NodeError::Rate(rate));
         }
-        let file = state.map(|folder| StateFile::in_folder(&folder)).transpose()?;
+        let file = state.as_deref().map(StateFile::in_folder).transpose()?;
         let persisted = file
             .as_ref()
             .map_or(Ok(PersistedState::default()), StateFile::read)?;
@@ -204,13 +207,13 @@ impl Node {
 
         let session = network::open(&connect)?;
         let started = wall_now();
-        let run_id = started.0.unsigned_abs();
+        let run_id = run_id::next(state.as_deref(), started);
         let shared = Arc::new(SharedState {
             rates: Mutex::new(rates),
             ..SharedState::default()
         });
         let clock = source.clock(rate);
-        let (map_message, info) = describe(&map, source.as_ref(), started)?;
+        let (map_message, info) = describe(&map, source.as_ref(), started, run_id)?;
 
         let replay_buffer = Arc::<Mutex<ReplayBuffer>>::default();
         let publisher = Publisher::new(
@@ -300,7 +303,8 @@ impl Node {
             &shared,
         )?;
         let link_reports = queryables::subscribe_to_link_reports(&session, &car, &shared, clock)?;
-        let alive = network::declare_alive(&session, &car)?;
+        let namesakes = namesake::watch(&session, &car, run_id, &shared, clock)?;
+        let alive = network::declare_alive(&session, &car, run_id)?;
         // The sensors start last: the pit wall can then see the first scan.
         let counters = Arc::clone(&shared.counters);
         let source = sensors::play(
@@ -327,6 +331,7 @@ impl Node {
             publisher,
             queryables,
             link_reports,
+            namesakes,
             alive,
         })
     }
@@ -366,6 +371,7 @@ impl Node {
         join(self.publisher);
         drop(self.queryables);
         drop(self.link_reports);
+        drop(self.namesakes);
         drop(self.alive);
         network::close(&self.session, CLOSING);
     }
@@ -383,8 +389,8 @@ fn describe(
     map: &RaceMap,
     source: &dyn Source,
     started: synpf::Stamp,
+    run_id: u64,
 ) -> Result<(Vec<u8>, Vec<u8>), protocol::CodecError> {
-    let run_id = started.0.unsigned_abs();
     let stamps = Stamps {
         run_id,
         sequence: 1,
@@ -393,7 +399,7 @@ fn describe(
     };
     let info = CarInfo {
         version: env!("CARGO_PKG_VERSION").into(),
-        started: run_id,
+        started: started.0.unsigned_abs(),
         source: source.description(),
         map: map.name.clone(),
         lap_length: map.raceline.as_ref().map(|line| line.length()),

@@ -26,6 +26,10 @@ pub struct Car {
     pub last_heard: i64,
     /// True when the log has an entry that the link is lost, until it is back.
     pub(crate) blind_logged: bool,
+    /// True when the log has an entry that health messages no longer come, until they do.
+    pub(crate) stale_logged: bool,
+    /// When a message of a second sender of this name was last dropped \[unix ns\].
+    pub(crate) two_senders: Option<i64>,
     /// The newest pose.
     pub pose: Option<(Header, Pose)>,
     /// The newest cloud.
@@ -56,6 +60,10 @@ pub struct Car {
 impl Car {
     /// A car that sends nothing for this long is BLIND \[ns\].
     pub const BLIND_AFTER: i64 = 1_000_000_000;
+    /// A car without a health message for this long is STALE, and for longer if its messages are rare \[ns\].
+    pub const STALE_AFTER: i64 = 1_500_000_000;
+    /// A car of which no second sender is noticed for this long is the only one \[ns\].
+    const ALONE_AFTER: i64 = 3_000_000_000;
     /// A connected car that is silent for less than this has a starved link. After that, it is silent on purpose \[s\].
     const STARVED_AT_MOST: f64 = 10.0;
 
@@ -67,6 +75,8 @@ impl Car {
             first_seen: at,
             last_heard: at,
             blind_logged: false,
+            stale_logged: false,
+            two_senders: None,
             pose: None,
             cloud: None,
             scan: None,
@@ -240,6 +250,22 @@ impl Car {
             uncertainty: (clock.round_trip as f64 * 0.5e-9) as f32,
             poses: u32::try_from(poses).unwrap_or(u32::MAX),
         })
+    }
+
+    /// Time since the last health message at `now` \[ns\], if the messages have stopped; None while they come, and before the
+    /// first.
+    pub fn stale_for(&self, now: i64) -> Option<i64> {
+        let stream = self.streams.get(&Topic::Health)?;
+        let silent = now - stream.last_arrival()?;
+        let usual = stream
+            .interval()
+            .map_or(0, |interval| (3e9 * interval.min(10.0)) as i64);
+        (self.alive && silent > Self::STALE_AFTER.max(usual)).then_some(silent)
+    }
+
+    /// True when two cars of this name send at `now` \[unix ns\].
+    pub fn two_senders(&self, now: i64) -> bool {
+        self.two_senders.is_some_and(|at| now - at < Self::ALONE_AFTER)
     }
 
     /// True when nothing arrives from the car at `now` \[unix ns\].

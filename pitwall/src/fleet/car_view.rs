@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::car::Car;
 use super::stream_statistics::StreamView;
+use crate::event::Rejection;
 
 /// A car, ready to be shown or written as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -62,7 +63,8 @@ impl Car {
         let why_unknown = self.why_unknown();
         // The last health message that can be decoded may be old.
         let health = self.health.as_ref().filter(|_| why_unknown.is_none());
-        let (state, causes) = match health {
+        let stale = self.stale_for(now);
+        let (state, mut causes) = match health {
             _ if blind => {
                 let gone = if self.alive {
                     ""
@@ -74,6 +76,11 @@ impl Car {
                     vec![format!("{gone}nothing heard for {quiet_s:.1} s")],
                 )
             }
+            Some(_) if stale.is_some() => {
+                let silent = seconds(stale.unwrap_or_default());
+                let text = format!("no health message for {silent:.1} s");
+                (State::Stale.to_string(), vec![text])
+            }
             None => match why_unknown {
                 Some(why) => ("UNKNOWN".to_owned(), vec![why]),
                 None => (State::Init.to_string(), vec!["no health message yet".to_owned()]),
@@ -83,12 +90,17 @@ impl Car {
                 health.causes.iter().map(ToString::to_string).collect(),
             ),
         };
+        if self.two_senders(now) {
+            causes.insert(0, Rejection::TwoSenders.to_string());
+        }
         let best = self.laps().iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
         CarView {
             car: self.name.clone(),
             state,
             causes,
-            state_for_s: health.map(|health| seconds(now + offset - health.since).max(0.0)),
+            state_for_s: health
+                .filter(|_| stale.is_none())
+                .map(|health| seconds(now + offset - health.since).max(0.0)),
             blind,
             alive: self.alive,
             quiet_s,

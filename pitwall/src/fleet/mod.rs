@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 use protocol::{CarName, Event, EventKind, Header, Severity, Telemetry, Topic};
 
-use crate::event::{EventPayload, FleetEvent};
+use crate::event::{EventPayload, FleetEvent, Rejection};
 
 pub use car::Car;
 pub use car_view::{CarView, PoseView, SetView};
@@ -78,6 +78,28 @@ impl Fleet {
                         text: format!("{topic} cannot be read: {error}"),
                         who: None,
                     });
+                }
+            }
+            EventPayload::Rejected {
+                topic, count, reason, ..
+            } => {
+                let stream = car.streams.entry(*topic).or_default();
+                let first = stream.note_rejected(*count) == *count;
+                let severity = if *reason == Rejection::TwoSenders {
+                    let alarm = !car.two_senders(at);
+                    car.two_senders = Some(at);
+                    alarm.then_some(Severity::Critical)
+                } else {
+                    first.then_some(Severity::Warning)
+                };
+                if let Some(severity) = severity {
+                    let text = format!("{topic}: dropped {count} of {reason}");
+                    let text = if *reason == Rejection::TwoSenders {
+                        reason.to_string()
+                    } else {
+                        text
+                    };
+                    self.add_entry(at, Some(name.clone()), severity, "identity", text, None);
                 }
             }
             EventPayload::Map { map, bytes } => car.map = Some((Arc::clone(map), Arc::clone(bytes))),
@@ -168,6 +190,25 @@ impl Fleet {
             return;
         };
         let blind = car.blind(now);
+        let silent = car.stale_for(now).filter(|_| !blind);
+        if silent.is_some() != car.stale_logged {
+            car.stale_logged = silent.is_some();
+            let (severity, text) = match silent {
+                Some(silent) => {
+                    let silent = silent as f64 * 1e-9;
+                    let text =
+                        format!("STALE: no health message for {silent:.1} s, though the car is connected");
+                    (Severity::Critical, text)
+                }
+                None => (Severity::Info, "health messages are back".to_owned()),
+            };
+            if silent.is_some() || !blind {
+                self.add_entry(now, Some(name.clone()), severity, "link", text, None);
+            }
+        }
+        let Some(car) = self.cars.get_mut(name) else {
+            return;
+        };
         if blind == car.blind_logged || (blind && now - car.first_seen <= Car::BLIND_AFTER) {
             return;
         }
@@ -322,6 +363,69 @@ mod tests {
         fleet.apply(&health(7 * SECOND, 2, Delivery::Live, State::Localized));
         let texts: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
         assert_eq!(texts, ["BLIND: nothing comes from the car", "link is back"]);
+    }
+
+    /// A car of which only its load comes once stayed "LOCALIZED".
+    #[test]
+    fn a_car_whose_health_stops_is_stale_whatever_else_arrives() {
+        const TENTH: i64 = SECOND / 10;
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        for i in 0..100 {
+            let at = i * TENTH;
+            if i < 50 {
+                fleet.apply(&health(at, i as u64 + 1, Delivery::Live, State::Localized));
+            } else {
+                let other = health(at, i as u64 + 1, Delivery::Live, State::Localized);
+                let EventPayload::Message {
+                    header, telemetry, ..
+                } = other.payload
+                else {
+                    panic!("a message");
+                };
+                fleet.apply(&FleetEvent {
+                    payload: EventPayload::Message {
+                        topic: Topic::RecordedHealth,
+                        delivery: Delivery::InOrder,
+                        header,
+                        telemetry,
+                        bytes: Arc::new([]),
+                    },
+                    ..other
+                });
+            }
+            fleet.tick(at);
+        }
+        let view = &fleet.view(99 * TENTH)[0];
+        assert_eq!((view.state.as_str(), view.blind), ("STALE", false));
+        assert_eq!(view.causes, ["no health message for 5.0 s"]);
+        assert_eq!(fleet.log().alarms(), 1);
+        fleet.apply(&health(10 * SECOND, 51, Delivery::Live, State::Localized));
+        assert_eq!(fleet.view(10 * SECOND)[0].state, "LOCALIZED");
+    }
+
+    #[test]
+    fn two_senders_of_one_name_are_one_alarm_and_the_first_cause() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        for second in 0..5 {
+            let at = second * SECOND;
+            fleet.apply(&health(at, second as u64 + 1, Delivery::Live, State::Localized));
+            fleet.apply(&FleetEvent {
+                payload: EventPayload::Rejected {
+                    topic: Topic::Pose,
+                    run_id: 9,
+                    sequence: 1,
+                    count: 40,
+                    reason: Rejection::TwoSenders,
+                },
+                ..appeared(at)
+            });
+        }
+        let view = &fleet.view(4 * SECOND)[0];
+        assert!(view.causes[0].starts_with("two cars of this name"), "{view:?}");
+        assert_eq!((fleet.log().alarms(), view.streams["pose"].rejected), (1, 200));
+        assert!(!fleet.car(&name()).expect("known").two_senders(8 * SECOND));
     }
 
     /// The page greys a car whose view is blind. It may show that within 3 s of the last message, so the fleet must know it

@@ -1,25 +1,34 @@
 //! Tracks which sequence numbers of a stream have arrived and which are missing.
 
+use std::collections::VecDeque;
+
 use serde::Serialize;
 
 use crate::number_ranges::NumberRanges;
 
 /// The arrivals of one stream: one sender, one key.
 ///
-/// Counting begins with the first message that arrives: what was sent before it is not missing. A sender that restarts
-/// has a higher `run_id` and begins a new count. What was missing from earlier runs stays missing.
+/// Counting begins with the first message that arrives: what was sent before it is not missing. A sender that restarts has
+/// another `run_id` and begins a new count with number 1. Run ids have no order. What is missing from earlier runs stays
+/// missing until it arrives.
 #[derive(Debug, Clone, Default)]
 pub struct SequenceTracker {
+    /// The runs in the order in which they began, at most [`Self::MAX_RUNS`].
+    runs: VecDeque<RunNumbers>,
+    received: u64,
+    restarts: u64,
+    /// Missing numbers of runs and of ranges that are no longer listed.
+    missing_before: u64,
+    filled: u64,
+}
+
+/// The numbers of one run.
+#[derive(Debug, Clone)]
+struct RunNumbers {
     run_id: u64,
     first: u64,
     last: u64,
-    received: u64,
-    restarts: u64,
-    /// Missing numbers of the current run.
     missing: NumberRanges,
-    /// Missing numbers of earlier runs, and of ranges beyond [`Self::MAX_RANGES`].
-    missing_before: u64,
-    filled: u64,
 }
 
 /// The place of an arrival in its stream.
@@ -36,28 +45,27 @@ pub enum SequenceStatus {
 }
 
 impl SequenceTracker {
-    /// Beyond this many missing ranges, the oldest are counted and no longer listed.
+    /// Beyond this many missing ranges of a run, the oldest are counted and no longer listed.
     const MAX_RANGES: usize = 4096;
+    /// Beyond this many runs, what is missing from the oldest is counted and no longer listed.
+    const MAX_RUNS: usize = 16;
 
     /// Notes an arrival. Messages with sequence number 0 are not counted.
     pub fn arrive(&mut self, run_id: u64, sequence: u64) -> SequenceStatus {
         if sequence == 0 {
             return SequenceStatus::New;
         }
-        if self.last == 0 || run_id > self.run_id {
+        let Some(run) = self.runs.iter_mut().rev().find(|run| run.run_id == run_id) else {
             self.begin(run_id, sequence);
             self.received += 1;
             return SequenceStatus::New;
-        }
-        if run_id < self.run_id {
-            return SequenceStatus::Duplicate;
-        }
-        if sequence > self.last {
-            let gap = sequence > self.last + 1;
+        };
+        if sequence > run.last {
+            let gap = sequence > run.last + 1;
             if gap {
-                self.miss([self.last + 1, sequence - 1]);
+                self.missing_before += run.miss([run.last + 1, sequence - 1]);
             }
-            self.last = sequence;
+            run.last = sequence;
             self.received += 1;
             return if gap {
                 SequenceStatus::AfterGap
@@ -65,7 +73,7 @@ impl SequenceTracker {
                 SequenceStatus::New
             };
         }
-        if !self.missing.remove(sequence) {
+        if !run.missing.remove(sequence) {
             return SequenceStatus::Duplicate;
         }
         self.received += 1;
@@ -73,41 +81,54 @@ impl SequenceTracker {
         SequenceStatus::Late
     }
 
-    /// Notes that messages up to number `to` were sent. If none has arrived yet, the count begins with `from`.
+    /// Notes that messages of the last run up to number `to` were sent. If none has arrived yet, the count begins with `from`.
     pub fn sent(&mut self, run_id: u64, from: u64, to: u64) {
-        if run_id < self.run_id || to < from || from == 0 {
+        if to < from || from == 0 {
             return;
         }
-        if self.last == 0 || run_id > self.run_id {
-            self.begin(run_id, from);
-            self.miss([from, to]);
-        } else if to > self.last {
-            self.miss([self.last + 1, to]);
+        let known = self.runs.iter().any(|run| run.run_id == run_id);
+        match self.runs.back_mut() {
+            Some(run) if run.run_id == run_id => {
+                if to > run.last {
+                    self.missing_before += run.miss([run.last + 1, to]);
+                    run.last = to;
+                }
+            }
+            _ if known => {}
+            _ => {
+                let run = self.begin(run_id, from);
+                run.miss([from, to]);
+                run.last = to;
+            }
         }
-        self.last = self.last.max(to);
+    }
+
+    /// True when a message of this run has arrived.
+    pub fn has_run(&self, run_id: u64) -> bool {
+        self.runs.iter().any(|run| run.run_id == run_id)
     }
 
     /// Begins the count of a run with this number.
-    fn begin(&mut self, run_id: u64, number: u64) {
-        if self.last > 0 {
+    fn begin(&mut self, run_id: u64, number: u64) -> &mut RunNumbers {
+        let mut missing = NumberRanges::default();
+        if !self.runs.is_empty() {
             self.restarts += 1;
-            self.missing_before += self.missing.count();
-            self.missing.clear();
             // A new run begins with number 1: what precedes this number is missing.
-            self.missing.insert([1, number - 1], ());
+            missing.insert([1, number - 1], ());
         }
-        self.run_id = run_id;
-        self.first = number;
-        self.last = number;
-    }
-
-    fn miss(&mut self, range: [u64; 2]) {
-        if self.missing.range_count() == Self::MAX_RANGES
-            && let Some([from, to]) = self.missing.pop_first()
+        if self.runs.len() == Self::MAX_RUNS
+            && let Some(oldest) = self.runs.pop_front()
         {
-            self.missing_before += to - from + 1;
+            self.missing_before = self.missing_before.saturating_add(oldest.missing.count());
         }
-        self.missing.insert(range, ());
+        self.runs.push_back(RunNumbers {
+            run_id,
+            first: number,
+            last: number,
+            missing,
+        });
+        let last = self.runs.len() - 1;
+        &mut self.runs[last]
     }
 
     /// Messages that arrived, duplicates not counted.
@@ -127,25 +148,38 @@ impl SequenceTracker {
 
     /// Messages that are missing.
     pub fn missing(&self) -> u64 {
-        self.missing_before + self.missing.count()
+        self.runs.iter().fold(self.missing_before, |sum, run| {
+            sum.saturating_add(run.missing.count())
+        })
     }
 
-    /// The highest number that arrived or is known to have been sent.
+    /// The highest number of the last run that arrived or is known to have been sent.
     pub fn last(&self) -> u64 {
-        self.last
+        self.runs.back().map_or(0, |run| run.last)
     }
 
     /// The counts and the missing ranges, for people and files.
     pub fn summary(&self) -> GapSummary {
+        let run = self.runs.back();
         GapSummary {
-            first: self.first,
-            last: self.last,
+            first: run.map_or(0, |run| run.first),
+            last: self.last(),
             received: self.received,
             missing: self.missing(),
-            missing_ranges: self.missing.iter().collect(),
+            missing_ranges: run.map(|run| run.missing.iter().collect()).unwrap_or_default(),
             filled_late: self.filled,
             sender_restarts: self.restarts,
         }
+    }
+}
+
+impl RunNumbers {
+    /// Adds missing numbers. Returns how many of others are no longer listed.
+    fn miss(&mut self, range: [u64; 2]) -> u64 {
+        let full = self.missing.range_count() == SequenceTracker::MAX_RANGES;
+        let dropped = full.then(|| self.missing.pop_first()).flatten();
+        self.missing.insert(range, ());
+        dropped.map_or(0, |[from, to]| to - from + 1)
     }
 }
 
@@ -206,12 +240,37 @@ mod tests {
         assert_eq!(gaps.arrive(2, 3), SequenceStatus::New);
         assert_eq!(
             gaps.arrive(1, 2),
-            SequenceStatus::Duplicate,
+            SequenceStatus::Late,
             "a late message of the old run"
         );
+        assert_eq!(gaps.arrive(1, 1), SequenceStatus::Duplicate);
         let summary = gaps.summary();
-        assert_eq!((summary.missing, summary.sender_restarts), (3, 1));
+        assert_eq!((summary.missing, summary.sender_restarts), (2, 1));
         assert_eq!(summary.missing_ranges, [[1, 2]]);
+    }
+
+    // A car whose clock was behind after a power cut once counted as a duplicate of itself.
+    #[test]
+    fn a_run_with_a_lower_id_is_a_new_run() {
+        let mut gaps = gaps(&[1, 2, 3]);
+        assert_eq!(gaps.arrive(0, 1), SequenceStatus::New);
+        assert_eq!(gaps.arrive(0, 2), SequenceStatus::New);
+        let summary = gaps.summary();
+        assert_eq!(
+            (summary.received, summary.missing, summary.sender_restarts),
+            (5, 0, 1)
+        );
+    }
+
+    #[test]
+    fn the_number_of_runs_is_limited_and_the_missing_ones_stay_counted() {
+        let mut gaps = SequenceTracker::default();
+        for run_id in 0..100 {
+            gaps.arrive(run_id, 1);
+            gaps.arrive(run_id, 3);
+        }
+        assert_eq!((gaps.missing(), gaps.restarts()), (100, 99));
+        assert_eq!(gaps.runs.len(), SequenceTracker::MAX_RUNS);
     }
 
     #[test]
@@ -243,6 +302,6 @@ mod tests {
         let sequences: Vec<_> = (0..10_000).map(|i| 2 * i + 1).collect();
         let gaps = gaps(&sequences);
         assert_eq!(gaps.missing(), 9_999);
-        assert_eq!(gaps.missing.range_count(), SequenceTracker::MAX_RANGES);
+        assert_eq!(gaps.runs[0].missing.range_count(), SequenceTracker::MAX_RANGES);
     }
 }

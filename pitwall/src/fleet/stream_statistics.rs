@@ -21,6 +21,7 @@ pub struct StreamStatistics {
     /// Run and number of messages that cannot be decoded. They are counted when a later message of the same run is decoded,
     /// which proves that the run exists.
     unproven: BTreeSet<(u64, u64)>,
+    rejected: u64,
     late_by: f64,
     /// Messages of the last second: when each arrived \[unix ns\], and how late \[s\].
     transits: VecDeque<(i64, f64)>,
@@ -48,18 +49,22 @@ impl StreamStatistics {
 
     /// Notes a message that arrived at `at` \[unix ns\].
     pub fn arrive(&mut self, header: &Header, at: i64) -> Freshness {
-        let order = |h: &Header| (h.run_id, h.sequence);
-        let later = self.unproven.split_off(&order(header));
-        for (run_id, sequence) in std::mem::replace(&mut self.unproven, later) {
-            if run_id == header.run_id {
-                self.gaps.arrive(run_id, sequence);
+        if !self.unproven.is_empty() {
+            let proven = (header.run_id, 0)..(header.run_id, header.sequence);
+            let proven: Vec<_> = self.unproven.range(proven).copied().collect();
+            for number in proven {
+                self.unproven.remove(&number);
+                self.gaps.arrive(number.0, number.1);
             }
         }
         let arrival = self.gaps.arrive(header.run_id, header.sequence);
         if arrival == SequenceStatus::Duplicate {
             return Freshness::Duplicate;
         }
-        let newer = self.newest.is_none_or(|newest| order(header) > order(&newest));
+        let newer = self
+            .newest
+            .is_none_or(|newest| newest.run_id != header.run_id || header.sequence > newest.sequence)
+            && arrival != SequenceStatus::Late;
         if newer {
             if self.newest.is_some_and(|newest| newest.run_id != header.run_id) {
                 self.published.clear();
@@ -88,19 +93,39 @@ impl StreamStatistics {
     pub fn note_unreadable(&mut self, header: Option<&Header>) -> u64 {
         self.unreadable += 1;
         if let Some(header) = header {
-            let order = |h: &Header| (h.run_id, h.sequence);
-            if self.newest.is_none_or(|newest| order(header) > order(&newest)) {
+            if self
+                .newest
+                .is_none_or(|newest| newest.run_id != header.run_id || header.sequence > newest.sequence)
+            {
                 self.newest_unreadable = Some(*header);
-                self.unproven.insert(order(header));
+                self.unproven.insert((header.run_id, header.sequence));
                 if self.unproven.len() > Self::UNPROVEN {
                     self.unproven.pop_first();
                 }
             } else {
-                // In the current run it fills its gap. One of an earlier run is ignored.
+                // In the current run it fills its gap.
                 self.gaps.arrive(header.run_id, header.sequence);
             }
         }
         self.unreadable
+    }
+
+    /// Notes messages that were dropped; returns how many there were.
+    pub(crate) fn note_rejected(&mut self, count: u64) -> u64 {
+        self.rejected = self.rejected.saturating_add(count);
+        self.rejected
+    }
+
+    /// What has arrived, by number.
+    pub(crate) fn gaps(&self) -> &SequenceTracker {
+        &self.gaps
+    }
+
+    /// Time between two messages of a steady stream \[s\]; None before the second one.
+    pub(crate) fn interval(&self) -> Option<f64> {
+        let intervals = self.published.len().checked_sub(1).filter(|n| *n > 0)?;
+        let span = (self.published.back()? - self.published.front()?) as f64 * 1e-9;
+        Some(span / intervals as f64)
     }
 
     /// Number of messages that cannot be decoded.
@@ -165,6 +190,7 @@ impl StreamStatistics {
             filled_late: self.gaps.filled(),
             sender_restarts: self.gaps.restarts(),
             unreadable: self.unreadable,
+            rejected: self.rejected,
         }
     }
 }
@@ -188,6 +214,8 @@ pub struct StreamView {
     pub sender_restarts: u64,
     /// Messages that cannot be decoded.
     pub unreadable: u64,
+    /// Messages that were dropped because their run or their number is not plausible.
+    pub rejected: u64,
 }
 
 #[cfg(test)]

@@ -61,6 +61,7 @@ impl Connection {
         for topic in Topic::all() {
             let delivery = match topic {
                 Topic::Alive => {
+                    live.push(Box::new(watch_runs(&session, &inputs).await?));
                     live.push(Box::new(watch_liveliness(&session, &sink, &inputs).await?));
                     continue;
                 }
@@ -132,6 +133,30 @@ impl Connection {
             tracing::warn!("the network did not confirm that the connection is closed");
         }
     }
+}
+
+/// Watches the liveliness tokens of the cars' runs.
+async fn watch_runs(
+    session: &zenoh::Session,
+    inputs: &Sender<DecoderInput>,
+) -> Result<impl Send + Sync + use<>, ConnectionError> {
+    let inputs = inputs.clone();
+    let key = Key::run_tokens_of_all_cars();
+    session
+        .liveliness()
+        .declare_subscriber(&key)
+        .history(true)
+        .callback(move |sample| {
+            if let Some((car, run_id)) = Key::parse_run_token(sample.key_expr().as_str()) {
+                let present = sample.kind() == SampleKind::Put;
+                // When the queue is full, messages of the run reveal it anyway.
+                inputs
+                    .try_send(DecoderInput::RunToken { car, run_id, present })
+                    .ok();
+            }
+        })
+        .await
+        .map_err(|e| ConnectionError::subscribe(&key, &e))
 }
 
 async fn watch_liveliness(

@@ -14,6 +14,7 @@ use zenoh::sample::{Sample, SampleKind};
 
 use super::gap_recovery::{GapRecovery, MessageId, MissingQuery, Outstanding};
 use super::query::{first_reply, stamps};
+use super::run_gate::{Rejected, RunGate};
 use crate::clock::unix_now;
 use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
 
@@ -33,6 +34,12 @@ pub(super) enum DecoderInput {
     },
     /// A car's liveliness token has appeared.
     Appeared(CarName),
+    /// The liveliness token of a car's run has appeared, or has vanished.
+    RunToken {
+        car: CarName,
+        run_id: u64,
+        present: bool,
+    },
     /// The full-rate topics are wanted, or no longer. The sender hears when held-back messages have been forwarded.
     WantRecorded(bool, oneshot::Sender<()>),
     /// A recording is about to end. The sender hears what is still outstanding.
@@ -57,6 +64,7 @@ struct ReceivedMessage {
 
 /// Decodes messages and recovers missing ones.
 pub(super) struct Decoder {
+    runs: RunGate<ReceivedMessage>,
     recovery: GapRecovery<ReceivedMessage>,
     sink: EventSink,
     queries: mpsc::UnboundedSender<MissingQuery>,
@@ -68,6 +76,7 @@ impl Decoder {
     /// Events go to `sink`, queries for missing messages to `queries`.
     pub(super) fn new(sink: EventSink, queries: mpsc::UnboundedSender<MissingQuery>) -> Self {
         Self {
+            runs: RunGate::default(),
             recovery: GapRecovery::default(),
             sink,
             queries,
@@ -94,6 +103,12 @@ impl Decoder {
             if ticked.elapsed() >= TICK {
                 ticked = Instant::now();
                 let now = unix_now();
+                for (_, id, received) in self.runs.tick(now) {
+                    self.put_in_order(id, received);
+                }
+                for rejected in self.runs.take_rejected(now) {
+                    self.report(rejected, now);
+                }
                 for received in self.recovery.overdue(now) {
                     self.forward(received);
                 }
@@ -115,6 +130,11 @@ impl Decoder {
     fn handle(&mut self, input: DecoderInput) {
         match input {
             DecoderInput::Appeared(car) => self.recovery.appeared(&car),
+            DecoderInput::RunToken { car, run_id, present } => {
+                for (id, received) in self.runs.token(&car, run_id, present, unix_now()) {
+                    self.put_in_order(id, received);
+                }
+            }
             DecoderInput::WantRecorded(on, done) => {
                 self.final_sync = None;
                 for received in self.recovery.want_recorded(on) {
@@ -139,19 +159,20 @@ impl Decoder {
                     return;
                 };
                 let bytes = sample.payload().to_bytes().into();
-                self.handle_message(ReceivedMessage {
+                let received = ReceivedMessage {
                     at,
                     delivery,
                     key,
                     bytes,
-                });
+                };
+                self.handle_message(received, false);
             }
         }
     }
 
-    fn handle_message(&mut self, received: ReceivedMessage) {
-        let header = Header::read(&received.bytes);
-        let (Ok(header), true) = (header, received.key.topic.recovered()) else {
+    /// Handles a message. `resent` is true for one that the car sent on request.
+    fn handle_message(&mut self, received: ReceivedMessage, resent: bool) {
+        let Ok(header) = Header::read(&received.bytes) else {
             return self.forward(received);
         };
         let id = MessageId {
@@ -160,23 +181,65 @@ impl Decoder {
             number: header.sequence,
         };
         let (car, at) = (received.key.car.clone(), received.at);
+        for (id, received) in self.runs.arrive(&car, id, resent, received, at) {
+            self.put_in_order(id, received);
+        }
+    }
+
+    /// Forwards a message of the followed run: in order, if its stream must be complete.
+    fn put_in_order(&mut self, id: MessageId, received: ReceivedMessage) {
+        if !id.topic.recovered() {
+            return self.forward(received);
+        }
+        let (car, at) = (received.key.car.clone(), received.at);
         for received in self.recovery.arrive(&car, id, received, at) {
             self.forward(received);
         }
+    }
+
+    /// Sends the event that messages were dropped.
+    fn report(&self, rejected: Rejected, at: i64) {
+        let Rejected {
+            car,
+            id:
+                MessageId {
+                    topic,
+                    run_id,
+                    number,
+                },
+            count,
+            reason,
+        } = rejected;
+        tracing::debug!(%car, %topic, run_id, number, count, %reason, "dropped messages");
+        (self.sink)(FleetEvent {
+            at,
+            car,
+            payload: EventPayload::Rejected {
+                topic,
+                run_id,
+                sequence: number,
+                count,
+                reason,
+            },
+        });
     }
 
     fn handle_answer(&mut self, MissingAnswer { at, car, reply }: MissingAnswer) {
         let Some((header, MissingReply { streams, messages })) = reply else {
             return self.recovery.unanswered(&car, at);
         };
+        if !self.runs.answered(&car, header.run_id, at) {
+            return self.recovery.unanswered(&car, at);
+        }
         let more = !messages.is_empty();
         for Resent { topic, bytes } in messages {
-            self.handle_message(ReceivedMessage {
+            let received = ReceivedMessage {
                 at,
                 delivery: Delivery::InOrder,
                 key: Key::new(car.clone(), topic),
                 bytes: bytes.into(),
-            });
+            };
+            self.handle_message(received, true);
         }
         let (released, stream_ends) = self.recovery.answered(&car, header.run_id, &streams, more, at);
         if let Some(outstanding) = stream_ends {

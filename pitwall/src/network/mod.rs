@@ -19,6 +19,7 @@ pub(crate) mod gap_recovery;
 mod query;
 mod reorder_buffer;
 mod role;
+mod run_gate;
 mod verdict;
 
 pub use client::{Client, REPLY_TIMEOUT, new_command_id};

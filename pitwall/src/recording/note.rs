@@ -5,7 +5,7 @@ use std::sync::Arc;
 use protocol::{CarInfo, CarName, Header, Topic};
 use serde::{Deserialize, Serialize};
 
-use crate::event::EventPayload;
+use crate::event::{EventPayload, Rejection};
 
 /// An event that is not a message.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -19,6 +19,13 @@ pub(super) enum Note {
         #[serde(default)]
         header: Option<Header>,
         error: String,
+    },
+    Rejected {
+        topic: Topic,
+        run_id: u64,
+        sequence: u64,
+        count: u64,
+        reason: Rejection,
     },
     Info {
         info: CarInfo,
@@ -61,6 +68,19 @@ impl Note {
                 header: *header,
                 error: error.clone(),
             },
+            EventPayload::Rejected {
+                topic,
+                run_id,
+                sequence,
+                count,
+                reason,
+            } => Self::Rejected {
+                topic: *topic,
+                run_id: *run_id,
+                sequence: *sequence,
+                count: *count,
+                reason: *reason,
+            },
             EventPayload::Info(info) => Self::Info { info: info.clone() },
             EventPayload::Clock { offset, round_trip } => Self::Clock {
                 offset: *offset,
@@ -83,6 +103,19 @@ impl From<Note> for EventPayload {
             Note::Appeared => Self::Appeared,
             Note::Vanished => Self::Vanished,
             Note::Unreadable { topic, header, error } => Self::Unreadable { topic, header, error },
+            Note::Rejected {
+                topic,
+                run_id,
+                sequence,
+                count,
+                reason,
+            } => Self::Rejected {
+                topic,
+                run_id,
+                sequence,
+                count,
+                reason,
+            },
             Note::Info { info } => Self::Info(info),
             Note::Clock { offset, round_trip } => Self::Clock { offset, round_trip },
             Note::Marker { who, text } => Self::Marker {

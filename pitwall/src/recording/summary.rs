@@ -30,6 +30,8 @@ pub struct StreamSummary {
     /// Time from the stream's last message to the end of the car's recording \[s\]. The end is the final sync, or else the
     /// car's last message on any topic. None when the stream has no message in the car's last run.
     pub behind_s: Option<f64>,
+    /// Messages that were dropped because their run or their number is not plausible. They are not missing.
+    pub rejected: u64,
     /// What arrived and what is missing.
     #[serde(flatten)]
     pub gaps: GapSummary,
@@ -53,6 +55,7 @@ impl fmt::Display for RecordingSummary {
             car,
             topic,
             behind_s,
+            rejected,
             gaps,
         } in &self.streams
         {
@@ -62,6 +65,13 @@ impl fmt::Display for RecordingSummary {
                 "{car:<12} {topic:<18} {:>9} {:>9} {:>9} {:>9} {behind:>9}",
                 gaps.first, gaps.last, gaps.received, gaps.missing
             )?;
+            if *rejected > 0 {
+                writeln!(
+                    f,
+                    "{:<12} {:<18} dropped {rejected}: not of the run that was followed, or an implausible number",
+                    "", ""
+                )?;
+            }
             for [from, to] in gaps.missing_ranges.iter().take(10) {
                 writeln!(f, "{:<12} {:<18} missing {from} to {to}", "", "")?;
             }

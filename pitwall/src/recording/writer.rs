@@ -22,6 +22,7 @@ pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
 #[derive(Default)]
 struct RecordedStream {
     gaps: SequenceTracker,
+    rejected: u64,
     /// When the newest message was published.
     until: PublishTime,
 }
@@ -76,16 +77,25 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 ..
             } => {
                 let published = (header.run_id, header.published);
-                if self.ends.get(car).is_some_and(|end| published > *end) {
-                    return Ok(());
-                }
                 let key = Key::new(car.clone(), *topic);
                 let name = key.to_string();
                 let stream = self.streams.entry(key).or_default();
+                let beyond_the_end = self.ends.get(car).is_some_and(|&(run_id, end)| {
+                    if header.run_id == run_id {
+                        header.published > end
+                    } else {
+                        !stream.gaps.has_run(header.run_id)
+                    }
+                });
+                if beyond_the_end {
+                    return Ok(());
+                }
                 if stream.gaps.arrive(header.run_id, header.sequence) == SequenceStatus::Duplicate {
                     return Ok(());
                 }
-                stream.until = stream.until.max(published);
+                if stream.until.0 != published.0 || stream.until.1 < published.1 {
+                    stream.until = published;
+                }
                 let times = Times {
                     arrived: *at,
                     published: header.published,
@@ -122,6 +132,10 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 return Ok(());
             }
             other => {
+                if let EventPayload::Rejected { topic, count, .. } = other {
+                    let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
+                    stream.rejected = stream.rejected.saturating_add(*count);
+                }
                 if let Some(note) = Note::of(other) {
                     self.notes += 1;
                     let times = Times {
@@ -154,8 +168,11 @@ impl<W: Write + Seek> RecordingWriter<W> {
     pub(super) fn summary(&self) -> RecordingSummary {
         let mut ends = self.ends.clone();
         for (key, stream) in &self.streams {
-            let end = ends.entry(key.car.clone()).or_default();
-            *end = stream.until.max(*end);
+            let end = ends.entry(key.car.clone()).or_insert(stream.until);
+            // Without a final sync, the end is the latest message of any topic.
+            if !self.ends.contains_key(&key.car) && (end.0 != stream.until.0 || end.1 < stream.until.1) {
+                *end = stream.until;
+            }
         }
         let behind = |car: &CarName, until: PublishTime| {
             let end = ends.get(car).copied().unwrap_or(until);
@@ -174,6 +191,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
                     car: key.car.clone(),
                     topic: key.topic,
                     behind_s: behind(&key.car, stream.until),
+                    rejected: stream.rejected,
                     gaps: stream.gaps.summary(),
                 })
                 .collect(),

@@ -9,7 +9,7 @@ use crate::{Message, Pose2, Schema};
 pub struct CarInfo {
     /// Version of the node.
     pub version: String,
-    /// Start of the node, in ns since 1970. It is the [`run_id`](crate::Header::run_id) of its messages.
+    /// Start of the node, in ns since 1970, by the car's clock.
     pub started: u64,
     /// Description of the source of the sensor data.
     pub source: String,

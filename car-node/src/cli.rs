@@ -48,7 +48,7 @@ pub(crate) enum Command {
 /// Where the sensor data comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum SourceKind {
-    /// A ROS 2 bag, played in real time.
+    /// A bag, played in real time.
     Bag,
     /// A simulated car that races on a simulated track.
     Simulator,
@@ -71,8 +71,8 @@ pub(crate) struct Run {
     /// Where the sensor data comes from.
     #[arg(long, value_enum)]
     pub(crate) source: SourceKind,
-    /// ROS 2 bag (MCAP) to play.
-    #[arg(long, value_name = "FILE.mcap", required_if_eq("source", "bag"))]
+    /// Bag to play: a rosbag2 folder, or a file (.mcap, .db3, .bag of ROS 1), compressed or not.
+    #[arg(long, value_name = "BAG", required_if_eq("source", "bag"))]
     pub(crate) bag: Option<PathBuf>,
     /// With --source ros2: the zenoh router (rmw_zenohd) or bridge of the ROS side.
     #[arg(long, value_name = "ENDPOINT", default_value = Ros2Options::ENDPOINT, value_parser = endpoint)]
@@ -162,8 +162,8 @@ pub(crate) struct Bags {
     /// Map: a map_server YAML file.
     #[arg(long, value_name = "MAP.yaml")]
     pub(crate) map: PathBuf,
-    /// ROS 2 bag (MCAP); may be repeated.
-    #[arg(long = "bag", value_name = "FILE.mcap", required = true, num_args = 1..)]
+    /// Bag: a rosbag2 folder, or a file (.mcap, .db3, .bag of ROS 1), compressed or not; may be repeated.
+    #[arg(long = "bag", value_name = "BAG", required = true, num_args = 1..)]
     pub(crate) files: Vec<PathBuf>,
     /// True poses, in place of a topic of the bag (one bag): CSV with stamp_s,x_m,y_m,heading_rad of base_link, as --poses
     /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad.

@@ -289,8 +289,8 @@ fn faults_are_named_with_their_file() {
         &["--scan-topic", "/scan_2"],
         &["/scan_2", "/vesc/odom"],
     );
-    fails(1, &map, &map, &[], &["map.yaml: ", "MCAP", "ros2 bag convert"]);
-    fails(1, &map, here, &[], &["is a folder", ".mcap"]);
+    fails(1, &map, &map, &[], &["map.yaml: ", "MCAP", "ROS 1"]);
+    fails(1, &map, here, &[], &["metadata.yaml", "cut.mcap, drive.mcap"]);
     fails(1, &map, &cut, &[], &["cut.mcap: ", "mcap recover"]);
     fails(1, &bag, &bag, &[], &["not a text file"]);
     let poses = here.join("truth.csv");

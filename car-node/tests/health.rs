@@ -35,6 +35,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
         .initialize(car.start().expect("known"))
         .expect("on the map");
     let mut log = SensorLog {
+        notes: Vec::new(),
         arrivals: Vec::new(),
         mount: Some(mount),
         truth: Vec::new(),

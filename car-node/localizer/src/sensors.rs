@@ -50,6 +50,30 @@ pub struct Odometry {
     pub twist: Twist,
 }
 
+impl Odometry {
+    /// The odometry of another frame of the same rigid car: of the one at `frame` in the frame that this is for.
+    #[must_use]
+    pub fn carried_to(self, frame: Pose) -> Self {
+        let (sin, cos) = frame.heading.sin_cos();
+        let Twist {
+            linear_x,
+            linear_y,
+            angular,
+        } = self.twist;
+        // The velocity of that point, in the directions of the old frame.
+        let (x, y) = (linear_x - angular * frame.y, linear_y + angular * frame.x);
+        Self {
+            stamp: self.stamp,
+            pose: self.pose * frame,
+            twist: Twist {
+                linear_x: cos * x + sin * y,
+                linear_y: cos * y - sin * x,
+                angular,
+            },
+        }
+    }
+}
+
 /// A gyroscope's reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct YawRate {
@@ -57,4 +81,29 @@ pub struct YawRate {
     pub stamp: Stamp,
     /// Yaw rate, left positive [rad/s].
     pub rate: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_point_ahead_of_the_axle_moves_sideways_in_a_bend() {
+        let axle = Odometry {
+            stamp: Stamp(1),
+            pose: Pose::new(1.0, 2.0, 0.5),
+            twist: Twist {
+                linear_x: 3.0,
+                linear_y: 0.0,
+                angular: 2.0,
+            },
+        };
+        let ahead = axle.carried_to(Pose::new(0.2, 0.0, 0.0));
+        assert!((ahead.twist.linear_x - 3.0).abs() < 1e-12 && (ahead.twist.linear_y - 0.4).abs() < 1e-12);
+        let back = ahead.carried_to(Pose::new(-0.2, 0.0, 0.0));
+        assert!(back.pose.distance(axle.pose) < 1e-12 && back.twist.linear_y.abs() < 1e-12);
+        // A frame that looks to the left sees forward motion as motion to the right.
+        let left = axle.carried_to(Pose::new(0.0, 0.0, std::f64::consts::FRAC_PI_2));
+        assert!(left.twist.linear_x.abs() < 1e-12 && (left.twist.linear_y + 3.0).abs() < 1e-12);
+    }
 }

@@ -76,7 +76,11 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
 /// Reads what a localizer needs of a bag.
 fn read_bag(bag: &Path, arguments: &TopicArguments) -> anyhow::Result<SensorLog> {
     let mount = arguments.laser.map(Mount::upright);
-    Ok(Bag::read(bag)?.sensors(&topics(arguments), mount)?)
+    let log = Bag::read(bag)?.sensors(&topics(arguments), mount)?;
+    for note in &log.notes {
+        eprintln!("car-node: {}: {note}", bag.display());
+    }
+    Ok(log)
 }
 
 fn topics(arguments: &TopicArguments) -> Topics {

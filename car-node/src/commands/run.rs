@@ -36,7 +36,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             let player = BagPlayer::new(bag.clone(), log);
             (map_file(arguments)?, Box::new(player), Start::Global)
         }
-        (SourceKind::Bag, None) => bail!("--source bag needs --bag FILE.mcap"),
+        (SourceKind::Bag, None) => bail!("--source bag needs --bag BAG"),
         (SourceKind::Ros2, _) => {
             if arguments.connect.is_empty() {
                 let text = "--source ros2 needs --connect ENDPOINT, such as tcp/192.168.1.10:7447: the default port on the \

@@ -205,6 +205,7 @@ mod tests {
     /// Ten seconds at 1 m/s along x: a scan of four beams and odometry, ten times a second, and the truth.
     fn log() -> SensorLog {
         let mut log = SensorLog {
+            notes: Vec::new(),
             arrivals: Vec::new(),
             mount: None,
             truth: Vec::new(),

@@ -29,16 +29,19 @@ impl BagPlayer {
             .into_iter()
             .map(|arrival| (arrival.log_time, Feed::Sensor(arrival.event)))
             .collect();
-        feeds.extend(log.truth.windows(2).map(|pair| {
+        feeds.extend(log.truth.windows(2).filter_map(|pair| {
             let [(stamp, pose), (next, next_pose)] = [pair[0], pair[1]];
             let time = next.since(stamp);
+            if time <= 0.0 {
+                return None;
+            }
             let [linear_x, linear_y, angular] = next_pose.since(pose).log().map(|v| v / time);
             let twist = Twist {
                 linear_x,
                 linear_y,
                 angular,
             };
-            (stamp, Feed::Truth(TrueMotion { stamp, pose, twist }))
+            Some((stamp, Feed::Truth(TrueMotion { stamp, pose, twist })))
         }));
         feeds.sort_by_key(|(due, _)| *due);
         Self {

@@ -1,6 +1,6 @@
 //! Static transforms between the car's frames: where the laser is mounted.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use maps::Pose;
 use nalgebra::{Isometry3, Vector3};
@@ -31,12 +31,25 @@ impl Mount {
     }
 }
 
+/// The car's own frame by REP 105.
+pub(crate) const BASE_LINK: &str = "base_link";
+
+/// True for a frame that is where `base_link` is, on the ground plane; namespaces do not matter.
+pub(crate) fn is_base(frame: &str) -> bool {
+    matches!(frame.rsplit('/').next(), Some(BASE_LINK | "base_footprint"))
+}
+
 /// The frames of `/tf_static`, as a forest.
 #[derive(Debug, Default)]
 pub struct Frames {
     /// Child to parent, with `parent_from_child`.
     parents: HashMap<String, (String, Isometry3<f64>)>,
+    /// Children whose transforms have changed.
+    moving: HashSet<String>,
 }
+
+/// A transform that changes by less than this is constant \[m\], \[rad\].
+const CONSTANT: f64 = 1e-4;
 
 /// A frame without the leading slash that ROS 1 used, and some drivers still do.
 fn bare(frame: &str) -> &str {
@@ -54,6 +67,42 @@ impl Frames {
             (bare(&transform.header.frame_id).to_owned(), parent_from_child),
         );
         true
+    }
+
+    /// Adds a transform that may change later. After the last one, [`Frames::drop_moving`] removes those that did.
+    pub(crate) fn insert_if_constant(&mut self, transform: &TransformStamped) {
+        let child = bare(&transform.child_frame_id);
+        let Some((_, known)) = self.parents.get(child) else {
+            self.insert(transform);
+            return;
+        };
+        let same = transform.transform.spatial().is_some_and(|now| {
+            let moved = known.inverse() * now;
+            moved.translation.vector.norm() < CONSTANT && moved.rotation.angle() < CONSTANT
+        });
+        if !same {
+            self.moving.insert(child.to_owned());
+        }
+    }
+
+    /// Removes the frames that have moved.
+    pub(crate) fn drop_moving(&mut self) {
+        for child in self.moving.drain() {
+            self.parents.remove(&child);
+        }
+    }
+
+    /// The `base_link` of the car that `frame` is on, and its pose in that frame on the ground plane. None when there is none
+    /// or the two are not connected.
+    pub(crate) fn base_link_beside(&self, frame: &str) -> Option<(String, Pose)> {
+        let frame = bare(frame);
+        let namespace = frame.rsplit_once('/').map_or("", |(namespace, _)| namespace);
+        let beside = [format!("{namespace}/{BASE_LINK}"), BASE_LINK.to_owned()];
+        beside.into_iter().find_map(|base_link| {
+            let mount = self.mount(frame, &base_link)?;
+            let base_link = bare(&base_link).to_owned();
+            Some((base_link, mount.base_link_from_laser))
+        })
     }
 
     /// True when no transform is known.

@@ -4,7 +4,6 @@ pub mod bag;
 mod bag_player;
 pub mod clock;
 pub mod frames;
-mod mcap_reader;
 mod ros2;
 mod simulated;
 

@@ -5,14 +5,15 @@
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
+use std::sync::Arc;
 
 use mcap::read::ChannelAccumulator;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{McapError, McapResult, Message};
+use mcap::{Channel, McapError, McapResult, Message};
 
-/// The largest record and the largest decompressed chunk that is read \[bytes\].
-const RECORD_LIMIT: usize = 256 * 1024 * 1024;
+use super::reader::RECORD_LIMIT;
+
 /// The most that is read at once \[bytes\], so that a damaged length takes no more memory than the file has.
 const BLOCK: usize = 1 << 20;
 
@@ -23,7 +24,13 @@ pub(super) struct McapReader<R> {
     channels: ChannelAccumulator<'static>,
     /// Messages of the current chunk.
     messages: VecDeque<Message<'static>>,
+    /// Channels that nobody has taken yet.
+    new_channels: Vec<Arc<Channel<'static>>>,
     progress: Progress,
+    /// Bytes read of the file.
+    position: u64,
+    /// The end of the messages was reached.
+    in_summary: bool,
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -41,20 +48,50 @@ impl<R: Read> McapReader<R> {
             records: LinearReader::new_with_options(options().with_emit_chunks(true)),
             channels: ChannelAccumulator::default(),
             messages: VecDeque::new(),
+            new_channels: Vec::new(),
             progress: Progress::Data,
+            position: 0,
+            in_summary: false,
         }
+    }
+
+    /// The channels that have appeared since the last call.
+    pub(super) fn take_channels(&mut self) -> Vec<Arc<Channel<'static>>> {
+        std::mem::take(&mut self.new_channels)
+    }
+
+    /// How much of the file has been read \[bytes\].
+    pub(super) fn position(&self) -> u64 {
+        self.position
+    }
+
+    /// True when all messages have been read and only the summary is left.
+    pub(super) fn in_summary(&self) -> bool {
+        self.in_summary
     }
 
     /// Reads until there is a message or the file ends.
     fn fill(&mut self) -> McapResult<()> {
         while self.messages.is_empty() && self.progress != Progress::Done {
-            let Some((opcode, body)) = next_record(&mut self.records, &mut self.source)? else {
+            let mut source = Counted {
+                source: &mut self.source,
+                position: &mut self.position,
+            };
+            let Some((opcode, body)) = next_record(&mut self.records, &mut source)? else {
                 self.progress = Progress::Done;
                 return Ok(());
             };
             match opcode {
-                op::DATA_END => self.progress = Progress::Summary,
-                _ if self.progress == Progress::Summary => {}
+                op::DATA_END => {
+                    self.progress = Progress::Summary;
+                    self.in_summary = true;
+                }
+                // What it repeats and what is damaged of it does not matter; a channel without messages may be new.
+                _ if self.progress == Progress::Summary => {
+                    if matches!(opcode, op::SCHEMA | op::CHANNEL) {
+                        self.read_record(opcode, &body).ok();
+                    }
+                }
                 op::CHUNK => self.read_chunk(&body)?,
                 _ => self.read_record(opcode, &body)?,
             }
@@ -87,7 +124,13 @@ impl<R: Read> McapReader<R> {
         }
         match mcap::parse_record(opcode, body)? {
             Record::Schema { header, data } => self.channels.add_schema_from_slice(header, &data),
-            Record::Channel(channel) => self.channels.add_channel(channel),
+            Record::Channel(channel) => {
+                let id = channel.id;
+                let known = self.channels.get(id).is_some();
+                self.channels.add_channel(channel)?;
+                self.new_channels.extend(self.channels.get(id).filter(|_| !known));
+                Ok(())
+            }
             Record::Message { header, data } => {
                 let unknown = || McapError::UnknownChannel(header.sequence, header.channel_id);
                 let channel = self.channels.get(header.channel_id).ok_or_else(unknown)?;
@@ -120,6 +163,20 @@ impl<R: Read> Iterator for McapReader<R> {
             return Some(Err(error));
         }
         self.messages.pop_front().map(Ok)
+    }
+}
+
+/// Counts what is read.
+struct Counted<'a, R> {
+    source: &'a mut R,
+    position: &'a mut u64,
+}
+
+impl<R: Read> Read for Counted<'_, R> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        let read = self.source.read(into)?;
+        *self.position += read as u64;
+        Ok(read)
     }
 }
 

@@ -170,6 +170,9 @@ pub(crate) enum Verb {
         /// The HTML file [default: FILE.html]
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
+        /// Another recording, whose laps are laid over these; may be given several times.
+        #[arg(long, value_name = "FILE")]
+        with: Vec<PathBuf>,
     },
     /// Write a recording's poses, truth, health and laps as CSV files.
     Export {

@@ -35,6 +35,7 @@
 // The commands name the library as any other program would.
 extern crate self as pitwall;
 
+mod analysis;
 mod cli;
 mod clock;
 mod commands;
@@ -57,6 +58,10 @@ mod web;
 
 #[cfg(feature = "rerun")]
 pub use crate::rerun::{RerunError, RerunOutlet, RerunView};
+pub use analysis::{
+    Channel, Disagreement, Invalid, LapBook, LapKind, LapTrace, MapCheck, MapFinding, PoseSample, Sectors,
+    TrackLine, ideal_lap,
+};
 pub use clock::unix_now;
 pub use event::{Delivery, EventPayload, EventSink, FleetEvent, Rejection, SentRange};
 pub use event_bus::{EventBus, FleetGuard};
@@ -75,6 +80,6 @@ pub use recording::{
     Recovered, StreamSummary, Unreadable, UnreadableCount, read_events, recover,
 };
 pub use replay::{Replay, ReplayView};
-pub use report::{CarReport, MeanSigma, Report, TableRow, TrueError};
+pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};
 pub use server::{PitWallError, PitWallOptions, PitWallServer};
 pub use web::{Page, PageOptions};

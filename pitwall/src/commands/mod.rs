@@ -70,7 +70,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             };
             replay::run(&file, options, speed, at.as_secs_f64(), json).await
         }
-        Verb::Report { file, output } => report::run(&file, output, json),
+        Verb::Report { file, output, with } => report::run(&file, output, &with, json),
         Verb::Export { file, output } => export::run(&file, output, json),
         Verb::Recover { file, output } => record::recover(&file, output, json),
     }

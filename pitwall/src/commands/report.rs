@@ -9,8 +9,13 @@ use pitwall::{CarReport, Report};
 use crate::output;
 use crate::terminal::text;
 
-pub(super) fn run(file: &Path, output: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
-    let report = Report::of(file)?;
+pub(super) fn run(
+    file: &Path,
+    output: Option<PathBuf>,
+    with: &[PathBuf],
+    json: bool,
+) -> anyhow::Result<ExitCode> {
+    let report = Report::with(file, with)?;
     let to = output.unwrap_or_else(|| file.with_extension("html"));
     std::fs::write(&to, report.to_html()).with_context(|| to.display().to_string())?;
     super::print_unreadable(&report.unreadable);
@@ -39,9 +44,11 @@ fn summary(car: &CarReport) -> String {
             |lateral| format!("{:.2} ± {:.2} cm", lateral.mean * 100.0, lateral.sigma * 100.0),
         );
         lines.push(format!(
-            "  {:<8} {} laps, {:.3} ± {:.3} s, off the line {lateral}, alignment {} %",
+            "  {:<8} {} laps, {} left out, median {} s, mean {:.3} ± {:.3} s, off the line {lateral}, alignment {} %",
             row.set,
             row.laps,
+            row.left_out,
+            text::number(row.quartiles_s.map(|[_, median, _]| median), 3),
             row.time_s.mean,
             row.time_s.sigma,
             text::number(row.alignment.map(|a| a * 100.0), 1),

@@ -5,8 +5,10 @@ use std::sync::Arc;
 
 use protocol::{
     CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params, Pose,
-    ScanView, Shadow, Telemetry, Topic, Truth,
+    ScanView, Shadow, State, Telemetry, Topic, Truth,
 };
+
+use crate::analysis::{LapBook, MapCheck, PoseSample, TrackLine};
 
 use super::clock_estimate::ClockEstimate;
 use super::history::{HealthHistory, HealthProfile, HealthSample, ProfileCell};
@@ -51,6 +53,8 @@ pub struct Car {
     /// The software on it.
     pub info: Option<CarInfo>,
     laps: LapTimer,
+    book: LapBook,
+    map_check: Option<MapCheck>,
     history: HealthHistory,
     health_profile: HealthProfile,
     clock: Option<ClockEstimate>,
@@ -88,6 +92,8 @@ impl Car {
             map: None,
             info: None,
             laps: LapTimer::default(),
+            book: LapBook::default(),
+            map_check: None,
             history: HealthHistory::default(),
             health_profile: HealthProfile::default(),
             clock: None,
@@ -113,6 +119,12 @@ impl Car {
             Telemetry::Pose(_) | Telemetry::Health(_) if topic.recorded() => {}
             Telemetry::Pose(pose) => {
                 self.pose = Some((*header, *pose));
+                if let Some(sample) = PoseSample::of(header, pose) {
+                    self.book.on_pose(&sample);
+                    if let Some(check) = &mut self.map_check {
+                        check.on_pose(sample.s, header.sensor);
+                    }
+                }
                 if let (Some(track), Some(length)) = (pose.track, self.lap_length()) {
                     let here = TrackPose {
                         at: header.sensor,
@@ -124,9 +136,18 @@ impl Car {
                 }
             }
             Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
-            Telemetry::Scan(scan) => self.scan = Some(scan.clone()),
+            Telemetry::Scan(scan) => {
+                let trusted = |health: &Health| matches!(health.state, State::Localized | State::Degraded);
+                if let Some(check) = &mut self.map_check
+                    && self.health.as_ref().is_some_and(trusted)
+                {
+                    check.on_scan(scan);
+                }
+                self.scan = Some(scan.clone());
+            }
             Telemetry::Health(health) => {
                 self.history.add(at, health);
+                self.book.on_health(header.sensor, health);
                 if let Some(metrics) = &health.metrics {
                     self.laps.on_metrics(metrics);
                 }
@@ -136,11 +157,15 @@ impl Car {
                 }
                 self.health = Some(health.clone());
             }
-            Telemetry::Load(load) => self.load = Some(load.clone()),
+            Telemetry::Load(load) => {
+                self.book.on_load(load);
+                self.load = Some(load.clone());
+            }
             Telemetry::Params(params) => self.params = Some(params.clone()),
             Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
             Telemetry::Truth(truth) => self.truth = Some(*truth),
             Telemetry::Event(event) => {
+                self.book.on_event(event);
                 if let EventKind::Lap {
                     lap,
                     time: Some(time),
@@ -153,6 +178,25 @@ impl Car {
             Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
         }
         true
+    }
+
+    /// Sets the map that it localizes on, with its encoded bytes.
+    pub(crate) fn set_map(&mut self, map: Arc<MapReply>, bytes: Arc<[u8]>) {
+        if let Some(line) = TrackLine::of(&map).map(Arc::new) {
+            self.book.set_line(line.clone());
+            self.map_check = Some(MapCheck::new(line));
+        }
+        self.map = Some((map, bytes));
+    }
+
+    /// Its laps over the track.
+    pub fn book(&self) -> &LapBook {
+        &self.book
+    }
+
+    /// Its scans compared with the map; None without a raceline.
+    pub fn map_check(&self) -> Option<&MapCheck> {
+        self.map_check.as_ref()
     }
 
     /// Laps driven, the last 500.

@@ -102,7 +102,7 @@ impl Fleet {
                     self.add_entry(at, Some(name.clone()), severity, "identity", text, None);
                 }
             }
-            EventPayload::Map { map, bytes } => car.map = Some((Arc::clone(map), Arc::clone(bytes))),
+            EventPayload::Map { map, bytes } => car.set_map(Arc::clone(map), Arc::clone(bytes)),
             EventPayload::Info(info) => car.info = Some(info.clone()),
             EventPayload::Marker { who, text } => {
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));

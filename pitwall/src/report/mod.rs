@@ -8,17 +8,22 @@
 mod figures;
 mod html;
 mod svg;
+mod timeline;
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use protocol::{CarName, MapReply, Pose2, State, Telemetry, Topic};
 use serde::Serialize;
 
+use crate::analysis::{AnalysisView, LapBook, LapData, LapKind, SessionLaps};
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
 use crate::fleet::Lap;
 use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
+use timeline::Timeline;
+
+pub use timeline::Alarm;
 
 /// The report on a recording.
 #[derive(Debug, Clone, Serialize)]
@@ -33,6 +38,8 @@ pub struct Report {
     pub notes: Vec<String>,
     /// The messages that cannot be decoded.
     pub unreadable: Vec<Unreadable>,
+    #[serde(skip)]
+    analysis: Option<(AnalysisView, Vec<(String, LapData)>)>,
 }
 
 /// One car.
@@ -56,8 +63,14 @@ pub struct CarReport {
     pub update_p99_ms: Option<f64>,
     /// Messages that were sent and are not in the recording.
     pub missing: u64,
+    /// The alarms with time and place.
+    pub alarm_list: Vec<Alarm>,
     #[serde(skip)]
     series: Series,
+    #[serde(skip)]
+    timeline: Timeline,
+    #[serde(skip)]
+    book: LapBook,
 }
 
 /// A row of the paper's table I: the laps on one set.
@@ -67,8 +80,12 @@ pub struct TableRow {
     pub set: String,
     /// Number of laps.
     pub laps: usize,
+    /// Laps of these that do not count: the car stood still, a pose was given or the like.
+    pub left_out: usize,
     /// Lap time, mean and standard deviation \[s\].
     pub time_s: MeanSigma,
+    /// Lap time of the laps that count: quarter, median and three quarters \[s\]; None where no lap counts.
+    pub quartiles_s: Option<[f64; 3]>,
     /// Mean distance of the estimate from the raceline, over the laps \[m\]; None without poses.
     pub lateral_m: Option<MeanSigma>,
     /// Mean alignment, in `[0, 1]`; None without health messages.
@@ -117,18 +134,14 @@ struct Series {
 struct PosePoint {
     sensor: i64,
     pose: Pose2,
-    /// Arc length on the raceline and distance from it \[m\].
-    track: Option<[f64; 2]>,
 }
 
-/// A health message, with the car's arc length on the raceline \[m\].
+/// A health message.
 #[derive(Debug, Clone, Copy)]
 struct HealthPoint {
     at_s: f64,
-    s: Option<f64>,
     state: State,
     alignment: f64,
-    slip: f64,
 }
 
 impl MeanSigma {
@@ -151,7 +164,15 @@ impl MeanSigma {
 impl Report {
     /// Reads a whole recording.
     pub fn of(path: &Path) -> Result<Self, RecordingError> {
+        Self::with(path, &[])
+    }
+
+    /// Reads a whole recording, and from others the laps to compare with.
+    pub fn with(path: &Path, others: &[PathBuf]) -> Result<Self, RecordingError> {
         let mut collector = Collector::default();
+        for other in others {
+            collector.others.push(SessionLaps::of(other)?);
+        }
         for event in read_events(path)? {
             collector.add(&event?);
         }
@@ -166,9 +187,41 @@ impl Report {
     }
 }
 
+impl CarReport {
+    /// For each lap, why it does not count; None for one that does.
+    fn kinds(&self) -> Vec<Option<&'static str>> {
+        kinds(&self.laps, &self.book)
+    }
+}
+
+/// For each lap, why it does not count; None for one that does, or of which no more is known.
+fn kinds(laps: &[Lap], book: &LapBook) -> Vec<Option<&'static str>> {
+    let traces: Vec<_> = book.laps().collect();
+    let mut from = 0;
+    laps.iter()
+        .map(|lap| {
+            let same = |trace: &&std::sync::Arc<crate::analysis::LapTrace>| {
+                trace.lap == lap.lap && trace.time_s.is_some_and(|time| (time - lap.time_s).abs() < 1e-6)
+            };
+            // Laps and traces are in the same order.
+            let at = from + traces[from..].iter().position(same)?;
+            from = at + 1;
+            match traces[at].kind {
+                LapKind::Invalid(reason) => Some(reason.words()),
+                _ => None,
+            }
+        })
+        .collect()
+}
+
 #[derive(Default)]
 struct Collector {
     fleet: Fleet,
+    timelines: BTreeMap<CarName, Timeline>,
+    /// Laps of other recordings.
+    others: Vec<SessionLaps>,
+    /// Log entries that are noted.
+    noted: u64,
     span: Option<(i64, i64)>,
     ticked: i64,
     series: BTreeMap<CarName, Series>,
@@ -186,10 +239,21 @@ impl Collector {
         while self.ticked + TICK < event.at {
             self.ticked += TICK;
             self.fleet.tick(self.ticked);
+            let at_s = (self.ticked - from) as f64 * 1e-9;
+            for car in self.fleet.cars() {
+                let timeline = self.timelines.entry(car.name.clone()).or_default();
+                timeline.note_state(car, self.ticked, at_s);
+            }
+            self.note_entries(at_s);
         }
         self.fleet.apply(event);
         self.unreadable.add(event);
         let at_s = (event.at - from) as f64 * 1e-9;
+        self.note_entries(at_s);
+        if let Some(car) = self.fleet.car(&event.car) {
+            let timeline = self.timelines.entry(event.car.clone()).or_default();
+            timeline.add(event, car, at_s);
+        }
         let series = self.series.entry(event.car.clone()).or_default();
         let EventPayload::Message {
             topic,
@@ -205,7 +269,6 @@ impl Collector {
                 let point = PosePoint {
                     sensor: header.sensor,
                     pose: pose.pose,
-                    track: pose.track.map(|track| [track.s, track.d]),
                 };
                 if topic.recorded() {
                     self.full_rate.entry(event.car.clone()).or_default().push(point);
@@ -217,10 +280,8 @@ impl Collector {
                 if let Some(metrics) = &health.metrics {
                     series.healths.push(HealthPoint {
                         at_s,
-                        s: series.poses.last().and_then(|point| Some(point.track?[0])),
                         state: health.state,
                         alignment: f64::from(metrics.alignment),
-                        slip: f64::from(metrics.slip),
                     });
                 }
             }
@@ -234,8 +295,38 @@ impl Collector {
         }
     }
 
+    /// Notes the alarms that are new in the log.
+    fn note_entries(&mut self, at_s: f64) {
+        for entry in self.fleet.log().since(self.noted) {
+            if let Some(car) = entry.car.as_ref().and_then(|name| self.fleet.car(name)) {
+                let timeline = self.timelines.entry(car.name.clone()).or_default();
+                timeline.note_entry(entry, car, at_s);
+            }
+        }
+        self.noted = self.fleet.log().last();
+    }
+
+    /// Laps and health over the track, with the data of every lap.
+    fn analysis(&self, session: &SessionLaps) -> (AnalysisView, Vec<(String, LapData)>) {
+        let sessions: Vec<_> = std::iter::once(session).chain(&self.others).collect();
+        let laps: Vec<_> = sessions.iter().flat_map(|session| session.cars()).collect();
+        let view = AnalysisView::of(&laps, |_| None);
+        let data = view
+            .laps
+            .iter()
+            .filter_map(|lap| Some((lap.id.clone(), AnalysisView::data(&laps, &lap.id)?)));
+        let data = data.collect();
+        (view, data)
+    }
+
     fn report(mut self, path: &Path) -> Option<Report> {
         let (from, to) = self.span?;
+        let session = SessionLaps::new(path, &self.fleet);
+        let books: BTreeMap<CarName, LapBook> = session
+            .cars()
+            .map(|car| (car.car.clone(), car.book.clone()))
+            .collect();
+        let analysis = self.analysis(&session);
         let mut cars = Vec::new();
         for (name, mut series) in self.series {
             let car = self.fleet.car(&name)?;
@@ -250,29 +341,26 @@ impl Collector {
             series.map = car.map.as_ref().map(|(map, _)| map.clone());
             series.length = car.lap_length();
             let view = car.view(to);
-            let alarms = self
-                .fleet
-                .log()
-                .since(0)
-                .filter(|line| {
-                    line.car.as_ref() == Some(&name) && line.severity == protocol::Severity::Critical
-                })
-                .count();
+            let timeline = self.timelines.remove(&name).unwrap_or_default();
+            let book = books.get(&name).cloned().unwrap_or_default();
             let mean = |i: usize| {
                 let count = series.loads.len();
                 (count > 0).then(|| series.loads.iter().map(|load| load[i]).sum::<f64>() / count as f64)
             };
             cars.push(CarReport {
                 laps: car.laps().to_vec(),
-                table: table(car.laps()),
+                table: table(car.laps(), &kinds(car.laps(), &book)),
                 states: states(&series.healths),
-                alarms,
+                alarms: timeline.alarms.len(),
+                alarm_list: timeline.alarms.clone(),
                 truth: true_error(&series.poses, &series.truths),
                 cpu: mean(1),
                 update_p99_ms: series.loads.iter().map(|load| load[2]).max_by(f64::total_cmp),
                 missing: view.streams.values().map(|stream| stream.missing).sum(),
                 car: name,
                 series,
+                timeline,
+                book,
             });
         }
         let notes = self
@@ -299,29 +387,49 @@ impl Collector {
             cars,
             notes,
             unreadable: self.unreadable.list(),
+            analysis: Some(analysis),
         })
     }
 }
 
-fn table(laps: &[Lap]) -> Vec<TableRow> {
-    let mut sets: BTreeMap<&str, Vec<&Lap>> = BTreeMap::new();
-    for lap in laps {
-        sets.entry(&lap.set).or_default().push(lap);
+fn table(laps: &[Lap], kinds: &[Option<&'static str>]) -> Vec<TableRow> {
+    let mut sets: BTreeMap<&str, Vec<(&Lap, bool)>> = BTreeMap::new();
+    for (i, lap) in laps.iter().enumerate() {
+        let counts = kinds.get(i).is_none_or(Option::is_none);
+        sets.entry(&lap.set).or_default().push((lap, counts));
     }
-    let row = |(set, laps): (&str, Vec<&Lap>)| {
+    let row = |(set, laps): (&str, Vec<(&Lap, bool)>)| {
         let values = |value: &dyn Fn(&Lap) -> Option<f64>| {
-            let values: Vec<f64> = laps.iter().filter_map(|lap| value(lap)).collect();
+            let values: Vec<f64> = laps.iter().filter_map(|(lap, _)| value(lap)).collect();
             MeanSigma::of(&values)
         };
+        let counted: Vec<f64> = laps
+            .iter()
+            .filter(|(_, counts)| *counts)
+            .map(|(lap, _)| lap.time_s)
+            .collect();
         Some(TableRow {
             set: set.to_owned(),
             laps: laps.len(),
+            left_out: laps.len() - counted.len(),
             time_s: values(&|lap| Some(lap.time_s))?,
+            quartiles_s: quartiles(counted),
             lateral_m: values(&|lap| lap.lateral_m),
             alignment: values(&|lap| Some(lap.grip?.alignment)).map(|alignment| alignment.mean),
         })
     };
     sets.into_iter().filter_map(row).collect()
+}
+
+/// A quarter, half and three quarters of the values are not greater, interpolated; None without a value.
+fn quartiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
+    values.sort_by(f64::total_cmp);
+    let last = values.len().checked_sub(1)?;
+    Some([0.25, 0.5, 0.75].map(|share| {
+        let at = share * last as f64;
+        let (low, high) = (values[at.floor() as usize], values[at.ceil() as usize]);
+        low + at.fract() * (high - low)
+    }))
 }
 
 /// Share of each state. A state lasts from one health message to the next, but not over a pause.
@@ -402,8 +510,14 @@ mod tests {
 
     #[test]
     fn table_one_has_a_row_for_each_set() {
-        let rows = table(&[lap(1, 9.0, "hq"), lap(2, 9.2, "hq"), lap(3, 10.0, "lq")]);
+        let laps = [lap(1, 9.0, "hq"), lap(2, 9.2, "hq"), lap(3, 10.0, "lq")];
+        let rows = table(&laps, &[None; 3]);
         assert_eq!(rows.len(), 2);
+        assert!(
+            rows[0]
+                .quartiles_s
+                .is_some_and(|[_, median, _]| (median - 9.1).abs() < 1e-9)
+        );
         let hq = &rows[0];
         assert_eq!((hq.set.as_str(), hq.laps), ("hq", 2));
         assert!((hq.time_s.mean - 9.1).abs() < 1e-9 && (hq.time_s.sigma - 0.02_f64.sqrt()).abs() < 1e-9);
@@ -414,7 +528,22 @@ mod tests {
                 sigma: 0.0
             }
         );
-        assert!(table(&[]).is_empty());
+        assert!(table(&[], &[]).is_empty());
+    }
+
+    /// One lap with a spin made the spread of all laps as large as a lap is long.
+    #[test]
+    fn a_lap_that_does_not_count_is_left_out_of_the_median() {
+        let laps: Vec<Lap> = [9.0, 9.1, 15.8, 9.2]
+            .iter()
+            .zip(1..)
+            .map(|(t, i)| lap(i, *t, "hq"))
+            .collect();
+        let row = &table(&laps, &[None, None, Some("the car stood still"), None])[0];
+        assert_eq!((row.laps, row.left_out), (4, 1));
+        let [low, median, high] = row.quartiles_s.expect("three laps");
+        assert!((median - 9.1).abs() < 1e-9 && (low - 9.05).abs() < 1e-9 && (high - 9.15).abs() < 1e-9);
+        assert_eq!(table(&laps[..1], &[Some("")])[0].quartiles_s, None);
     }
 
     #[test]
@@ -429,7 +558,6 @@ mod tests {
         let point = |sensor, x, y| PosePoint {
             sensor,
             pose: at(x, y),
-            track: None,
         };
         // Half way the truth is at y = 0.1; the pose is 0.03 behind it and 0.04 to its right.
         let error = true_error(&[point(10_000_000, 0.04, 0.07)], &truths).expect("compared");
@@ -446,10 +574,8 @@ mod tests {
     fn a_state_lasts_until_the_next_message_but_not_over_a_pause() {
         let point = |at_s, state| HealthPoint {
             at_s,
-            s: None,
             state,
             alignment: 1.0,
-            slip: 0.0,
         };
         let shares = states(&[
             point(0.0, State::Localized),

@@ -10,12 +10,16 @@
 //! POST /record         {"on": true|false, "operator"}
 //! POST /mark           {car, operator, text}
 //! POST /acknowledge    {operator}: acknowledges every alarm so far
+//! GET  /analysis       laps, sectors and map faults of all cars; /analysis/lap?id=... the data of one lap
+//! POST /analysis/load  {file}: adds the laps of a recording; GET /analysis/files lists them
+//! POST /sectors        {track, borders}: keeps the sectors of a track
 //! POST /replay         {"playing": bool, "speed": n, "at": s}, each optional; only in a replay
 //! POST /rerun          starts the data stream for the Rerun viewer and returns its URL, under /rerun/
 //! ```
 //!
 //! Requests from other origins are rejected. The `Content-Security-Policy` keeps the page from loading anything from
 //! elsewhere. On an address other than loopback, a token is required.
+mod analysis;
 mod api;
 mod disk;
 mod guard;
@@ -23,6 +27,7 @@ mod operators;
 #[cfg(feature = "rerun")]
 mod rerun;
 mod snapshot;
+mod tracks;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -42,8 +47,10 @@ use crate::clock::unix_now;
 use crate::event_bus::EventBus;
 use crate::fleet_service::FleetService;
 use crate::replay::Replay;
+use analysis::Sessions;
 use guard::Guard;
 use operators::Operators;
+use tracks::Tracks;
 
 /// Where the page is served and recordings go.
 #[derive(Debug, Clone)]
@@ -81,6 +88,8 @@ struct App {
     recordings: Arc<PathBuf>,
     disk_free: watch::Receiver<Option<u64>>,
     operators: Operators,
+    tracks: Tracks,
+    sessions: Sessions,
     stopping: watch::Receiver<bool>,
     #[cfg(feature = "rerun")]
     pane: Arc<tokio::sync::Mutex<Option<rerun::Pane>>>,
@@ -138,6 +147,8 @@ impl Page {
             bus,
             service,
             replay,
+            tracks: Tracks::new(&options.recordings),
+            sessions: Sessions::default(),
             recordings: Arc::new(options.recordings),
             disk_free,
             operators: Operators::default(),
@@ -153,6 +164,11 @@ impl Page {
             .route("/record", post(api::record))
             .route("/mark", post(api::mark))
             .route("/acknowledge", post(api::acknowledge))
+            .route("/analysis", get(analysis::view))
+            .route("/analysis/lap", get(analysis::lap))
+            .route("/analysis/files", get(analysis::files))
+            .route("/analysis/load", post(analysis::load))
+            .route("/sectors", post(analysis::keep_sectors))
             .route("/replay", post(api::replay));
         #[cfg(feature = "rerun")]
         let router = router
@@ -231,6 +247,11 @@ fn files() -> Router<App> {
             "/style.css",
             file(include_str!("page/style.css"), "text/css; charset=utf-8"),
         )
+        .route(
+            "/analysis.css",
+            file(include_str!("page/analysis.css"), "text/css; charset=utf-8"),
+        )
+        .route("/analysis.js", file(include_str!("page/analysis.js"), script))
         .route("/app.js", file(include_str!("page/app.js"), script))
         .route("/cards.js", file(include_str!("page/cards.js"), script))
         .route("/chart.js", file(include_str!("page/chart.js"), script))

@@ -54,6 +54,8 @@ pub(super) struct Snapshot {
     log: Vec<LogEntry>,
     /// Alarms up to this entry have been acknowledged.
     acknowledged: u64,
+    /// Changes when laps or sessions of the analysis do.
+    analysed: u64,
     /// The operators of all open pages.
     operators: Vec<String>,
     replay: Option<ReplayView>,
@@ -215,6 +217,8 @@ impl Snapshot {
             .map(|car| car.name.clone())
             .collect();
         let acknowledged = fleet.log().acknowledged();
+        let ended: u64 = fleet.cars().map(|car| car.book().ended()).sum();
+        let analysed = ended + app.sessions.count() as u64 * 1_000_000;
         drop(fleet);
         Self {
             now,
@@ -231,6 +235,7 @@ impl Snapshot {
             selected,
             log,
             acknowledged,
+            analysed,
             operators: app.operators.names(),
             replay: app.replay.as_ref().map(|replay| replay.view()),
             hello,

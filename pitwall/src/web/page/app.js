@@ -6,6 +6,7 @@ import { Large } from "/large.js";
 import { Track, palette } from "/track.js";
 import { Log, showLaps, showNumbers, showStandings } from "/lists.js";
 import { Sound } from "/sound.js";
+import { Analysis } from "/analysis.js";
 
 const $ = (id) => document.getElementById(id);
 const press = (button, on) => button.setAttribute("aria-pressed", String(on));
@@ -96,6 +97,7 @@ function take(next) {
   }
   if (!$("numbers-panel").hidden) showNumbers($("numbers"), next.cars[index], pace);
   if (!$("large").hidden && index >= 0) big.update(next.cars[index], index, cards.history(selected), next.now / 1e9);
+  showAnalysis(next);
   // After this frame is drawn.
   requestAnimationFrame(() => {
     link.drawn(next.number);
@@ -301,12 +303,60 @@ const prefersLight = matchMedia("(prefers-color-scheme: light)").matches;
 theme(localStorage.getItem("theme") || (prefersLight ? "light" : "dark"));
 const otherTheme = () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
 
-const TABS = ["log", "laps", "numbers"];
+/// Laps over the track: made when it is shown first, updated when laps have ended.
+let analysis = null;
+let analysed = null;
+async function showAnalysis(next) {
+  if ($("analysis-panel").hidden || !next) return;
+  const key = `${next.epoch}:${next.analysed}`;
+  if (key === analysed) return;
+  analysed = key;
+  analysis ??= new Analysis($("analysis-panel"), { load: loadLap, keep: keepSectors, extra: [otherSession()] });
+  const response = await fetch("/analysis").catch(() => null);
+  if (response?.ok) analysis.update(await response.json());
+  else analysed = null;
+}
+async function loadLap(id) {
+  const response = await fetch(`/analysis/lap?id=${encodeURIComponent(id)}`).catch(() => null);
+  return response?.ok ? response.json() : null;
+}
+async function keepSectors(track, borders) {
+  const { ok, body } = await post("/sectors", { track, borders });
+  analysed = null;
+  return ok ? null : body;
+}
+/// A list of recordings whose laps can be laid over these.
+function otherSession() {
+  const list = element("select");
+  list.setAttribute("aria-label", "Laps of another recording");
+  const fill = async () => {
+    const files = await fetch("/analysis/files").then((r) => r.json()).catch(() => []);
+    list.replaceChildren(new Option("+ other recording", ""), ...files.map((file) => new Option(file)));
+  };
+  list.append(new Option("+ other recording", ""));
+  list.addEventListener("pointerdown", () => list.options.length < 2 && fill());
+  list.addEventListener("focus", () => list.options.length < 2 && fill());
+  list.addEventListener("change", async () => {
+    if (!list.value) return;
+    list.disabled = true;
+    const { ok, body } = await post("/analysis/load", { file: list.value });
+    list.disabled = false;
+    list.value = "";
+    if (!ok) analysis.say(body);
+    analysed = null;
+  });
+  return list;
+}
+
+const TABS = ["log", "laps", "numbers", "analysis"];
 const tab = (shown) => {
   for (const other of TABS) {
     $(`tab-${other}`).setAttribute("aria-selected", String(other === shown));
     $(`${other}-panel`).hidden = other !== shown;
   }
+  // The plots need the room of the track.
+  document.querySelector("main").classList.toggle("analysing", shown === "analysis");
+  if (shown === "analysis") showAnalysis(snapshot);
 };
 for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => tab(name));
 for (const [word, [shape, , meaning]] of Object.entries(STATES)) $("legend").append(element("li", "", `${shape} ${word}: ${meaning}`));
@@ -330,7 +380,7 @@ const step = (by) => {
 const KEYS = {
   r: record, t: otherTheme, "?": help, 0: fit, f: () => follow(), g: () => search(), m: mark, p: paint, s: shadow, o: () => large(),
   v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,
-  e: () => tab("log"), l: () => tab("laps"), u: () => tab("numbers"),
+  e: () => tab("log"), l: () => tab("laps"), u: () => tab("numbers"), d: () => tab("analysis"),
   "+": () => track.zoom(1.3), "=": () => track.zoom(1.3), "-": () => track.zoom(1 / 1.3),
   c: () => selected && act(selected, { params: "confirm" }),
   H: () => cards.cards.get(selected)?.choose("hq"), L: () => cards.cards.get(selected)?.choose("lq"),

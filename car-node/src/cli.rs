@@ -1,11 +1,13 @@
 //! The command line.
 #![allow(clippy::doc_markdown, reason = "these comments are what --help prints")]
 
+use std::fmt;
 use std::path::PathBuf;
 
 use car_node::evaluate::Fault;
 use car_node::localization::Start;
 use car_node::network::endpoint;
+use car_node::recording::RecordOptions;
 use car_node::ros2::topics;
 use car_node::sensors::Ros2Options;
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -122,6 +124,16 @@ pub(crate) struct Run {
     /// Folder for sets that are stored on the car [default: synpf/<car> in the user's state folder].
     #[arg(long, value_name = "FOLDER")]
     pub(crate) state: Option<PathBuf>,
+    /// Record everything on the car's own disk into this folder, from the start. A pit wall can stop it, and start it without this
+    /// option, too [default folder: recordings in the state folder].
+    #[arg(long, value_name = "FOLDER")]
+    pub(crate) record: Option<PathBuf>,
+    /// Most space for all recordings on the car, such as 8G; then the oldest are deleted.
+    #[arg(long, value_name = "SIZE", default_value_t = Size(RecordOptions::LIMIT), value_parser = size)]
+    pub(crate) record_limit: Size,
+    /// Size of one file of a recording.
+    #[arg(long, value_name = "SIZE", default_value_t = Size(RecordOptions::SPLIT), value_parser = size)]
+    pub(crate) record_split: Size,
     /// Seed of the filter's and the simulator's random numbers.
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: u64,
@@ -131,6 +143,39 @@ pub(crate) struct Run {
     /// Which topics to take.
     #[command(flatten)]
     pub(crate) topics: TopicArguments,
+}
+
+/// A size \[bytes\].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Size(pub(crate) u64);
+
+impl fmt::Display for Size {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let unit = SIZE_UNITS
+            .iter()
+            .find(|(_, unit)| self.0 >= *unit && self.0 % unit == 0);
+        match unit {
+            Some((name, unit)) => write!(f, "{}{name}", self.0 / unit),
+            None => write!(f, "{}", self.0),
+        }
+    }
+}
+
+const SIZE_UNITS: [(&str, u64); 3] = [("G", 1 << 30), ("M", 1 << 20), ("k", 1 << 10)];
+
+/// `8G`, `64M`, `500k`, or a number of bytes. A unit is 1024 of the one below.
+fn size(text: &str) -> Result<Size, String> {
+    let (number, unit) = SIZE_UNITS
+        .iter()
+        .find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit)))
+        .unwrap_or((text, 1));
+    let number: u64 = number
+        .parse()
+        .map_err(|_| format!("{text:?} is not a size; use 8G, 64M or 500k"))?;
+    number
+        .checked_mul(unit)
+        .map(Size)
+        .ok_or_else(|| format!("{text:?} is too large"))
 }
 
 /// Heading of the topics in --help.

@@ -43,6 +43,7 @@ pub mod localization;
 pub mod network;
 pub mod node;
 pub mod race;
+pub mod recording;
 pub mod ros2;
 pub mod sensors;
 pub mod statistics;

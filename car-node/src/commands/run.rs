@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, anyhow, bail};
 use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
+use car_node::recording::RecordOptions;
 use car_node::ros2::pose_publisher;
 use car_node::sensors::frames::Mount;
 use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source};
@@ -75,6 +76,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         .state
         .clone()
         .or_else(|| default_state_folder(car.as_str()));
+    config.record = record_options(arguments, config.state.as_deref());
     let node = Node::start(config)?;
     let wall = if arguments.connect.is_empty() {
         "a pit wall on this machine or nearby".to_owned()
@@ -103,6 +105,18 @@ fn name(arguments: &Run) -> anyhow::Result<CarName> {
         Some(car) => Ok(car.clone()),
         None => Ok(CarName::new(DEFAULT_NAME)?),
     }
+}
+
+/// Where to record on the car: where the user says, else beside the car's state; None on a car without either.
+fn record_options(arguments: &Run, state: Option<&Path>) -> Option<RecordOptions> {
+    let folder = arguments.record.clone();
+    let start = folder.is_some();
+    Some(RecordOptions {
+        folder: folder.or_else(|| Some(state?.join("recordings")))?,
+        limit: arguments.record_limit.0,
+        split: arguments.record_split.0,
+        start,
+    })
 }
 
 /// Finds the live sensors. Prints what is missing while it waits.

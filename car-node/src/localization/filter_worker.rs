@@ -166,6 +166,11 @@ impl FilterWorker {
         throttle.rates(wanted)
     }
 
+    /// True when the full-rate streams are wanted: by the operator, or by the recorder on the car.
+    fn records(&self) -> bool {
+        self.rates().recorded || self.config.shared.recording()
+    }
+
     /// Executes a command. A reply that nobody waits for any more is discarded.
     fn execute(&mut self, command: FilterCommand) {
         let next = self.update_number() + 1;
@@ -256,7 +261,7 @@ impl FilterWorker {
         let event = match feed {
             Feed::Sensor(event) => event,
             Feed::Truth(truth) => {
-                if self.rates().recorded {
+                if self.records() {
                     self.config.shared.telemetry.record(Record::Truth(truth));
                 }
                 return;
@@ -276,7 +281,11 @@ impl FilterWorker {
             SensorEvent::Odometry(odometry) => self.on_odometry(odometry, now),
             SensorEvent::YawRate(yaw_rate) => {
                 self.forward(|| ShadowInput::YawRate(yaw_rate));
-                self.config.localizer.on_yaw_rate(&yaw_rate)
+                let result = self.config.localizer.on_yaw_rate(&yaw_rate);
+                if self.config.shared.recording() {
+                    self.config.shared.telemetry.record(Record::YawRate(yaw_rate));
+                }
+                result
             }
             SensorEvent::Scan(scan) => self.on_scan(scan, queued),
         };
@@ -304,7 +313,7 @@ impl FilterWorker {
         self.forward(|| ShadowInput::Odometry(odometry));
         self.config.monitor.on_odometry(now);
         self.last_odometry = Some(odometry.pose);
-        if self.rates().recorded {
+        if self.records() {
             self.config.shared.telemetry.record(Record::Odometry(odometry));
         }
         let Some(update) = &self.last_update else {
@@ -360,7 +369,8 @@ impl FilterWorker {
         self.share(estimate, update.mode);
         self.count_laps(&update);
         let report = self.pose_report(estimate, &update, false);
-        if rates.recorded {
+        let records = self.records();
+        if records {
             shared.telemetry.record(Record::Pose(report.clone()));
         }
         if self.paces.pose.due(update.stamp, rates.pose) {
@@ -389,7 +399,7 @@ impl FilterWorker {
                 set: self.config.set.clone(),
             }))
         });
-        if rates.recorded {
+        if records {
             shared.telemetry.record(Record::Scan(scan));
         }
         self.last_update = Some(update);
@@ -500,7 +510,7 @@ impl FilterWorker {
         let state = self.config.monitor.verdict().state;
         let changed = state != self.last_state;
         let live = self.paces.health.due(now, rates.health) || changed;
-        let recorded = updated && rates.recorded;
+        let recorded = updated && self.records();
         if !live && !recorded {
             return;
         }

@@ -35,6 +35,7 @@ use crate::localization::filter_worker::{self, FilterConfig};
 use crate::localization::shadow;
 use crate::localization::shadow_channel::shadow_channel;
 use crate::network::{self, NetworkError};
+use crate::recording::{FileHead, FileServer, RecordError, RecordOptions, RecorderThread};
 use crate::sensors::clock::{SensorClock, wall_now};
 use crate::sensors::{self, PoseEstimate, Source};
 use crate::telemetry::load;
@@ -83,6 +84,8 @@ pub struct NodeConfig {
     pub state: Option<PathBuf>,
     /// Receives every pose estimate while the car is localized, such as for the car's controller.
     pub pose_sink: Option<Sender<PoseEstimate>>,
+    /// Where to record on the car's own disk; without it, the car does not record.
+    pub record: Option<RecordOptions>,
 }
 
 impl NodeConfig {
@@ -102,6 +105,7 @@ impl NodeConfig {
             thresholds: Thresholds::default(),
             state: None,
             pose_sink: None,
+            record: None,
         }
     }
 }
@@ -127,6 +131,9 @@ pub enum NodeError {
     /// A message about the car itself does not encode, such as a map that is too large.
     #[error("{0}")]
     Message(#[from] protocol::CodecError),
+    /// The recording on the car does not start.
+    #[error("recording on the car: {0}")]
+    Record(#[from] RecordError),
     /// A thread does not start.
     #[error("cannot start a thread: {0}")]
     Thread(#[from] std::io::Error),
@@ -151,9 +158,11 @@ pub struct Node {
     filter: JoinHandle<()>,
     command_server: JoinHandle<()>,
     query_server: JoinHandle<()>,
+    file_server: JoinHandle<()>,
     load: JoinHandle<()>,
     shadow: JoinHandle<()>,
     publisher: JoinHandle<()>,
+    recorder: Option<RecorderThread>,
     queryables: Vec<Queryable<()>>,
     link_reports: Subscriber<()>,
     namesakes: Subscriber<()>,
@@ -164,6 +173,8 @@ pub struct Node {
 const CLOSING: Duration = Duration::from_secs(2);
 /// Commands and queries that wait.
 const QUEUE: usize = 64;
+/// Requests for recordings that wait. A pit wall asks for one piece at a time.
+const FILE_REQUESTS: usize = 8;
 
 impl Node {
     /// Starts a car. It is on the network when this returns, or goes on trying to join it.
@@ -186,6 +197,7 @@ impl Node {
             thresholds,
             state,
             pose_sink,
+            record,
         } = config;
         if !(rate.is_finite() && rate > 0.0) {
             return Err(NodeError::Rate(rate));
@@ -208,12 +220,30 @@ impl Node {
         let session = network::open(&connect)?;
         let started = wall_now();
         let run_id = run_id::next(state.as_deref(), started);
+        let clock = source.clock(rate);
+        let (map_message, info, info_message) = describe(&map, source.as_ref(), started, run_id)?;
+        let recorder = record
+            .map(|options| {
+                let head = FileHead {
+                    car: car.clone(),
+                    run_id,
+                    map: map_message.clone(),
+                    info,
+                };
+                RecorderThread::prepare(options, head)
+            })
+            .transpose()?;
+        let (recorder, launch) = recorder.unzip();
         let shared = Arc::new(SharedState {
             rates: Mutex::new(rates),
+            recorder,
             ..SharedState::default()
         });
-        let clock = source.clock(rate);
-        let (map_message, info) = describe(&map, source.as_ref(), started, run_id)?;
+        let recorder = launch.map(|launch| {
+            let shared = Arc::clone(&shared);
+            launch.run(move |kind| shared.event(clock.now(), 0, kind, None, None))
+        });
+        let recorder = recorder.transpose()?;
 
         let replay_buffer = Arc::<Mutex<ReplayBuffer>>::default();
         let publisher = Publisher::new(
@@ -231,6 +261,7 @@ impl Node {
         let (to_filter, filter_commands) = bounded(QUEUE);
         let (to_command_server, command_requests) = bounded(QUEUE);
         let (to_query_server, query_requests) = bounded(QUEUE);
+        let (to_file_server, file_requests) = bounded(FILE_REQUESTS);
         let (to_shadow, shadow_commands) = bounded(QUEUE);
         let (shadow_sender, shadow_receiver) = shadow_channel();
         let store = ParameterStore::new(persisted, set.name, set.parameters, started);
@@ -287,12 +318,18 @@ impl Node {
         )?;
         let query_server = QueryServer {
             map: map_message,
-            info,
+            info: info_message,
             replay_buffer,
             shared: Arc::clone(&shared),
             run_id,
         };
         let query_server = query_server.start(query_requests, control_stops.clone())?;
+        let file_server = FileServer {
+            recorder: shared.recorder.clone(),
+            shared: Arc::clone(&shared),
+            run_id,
+        };
+        let file_server = file_server.start(file_requests, control_stops.clone())?;
         let load = load::start(Arc::clone(&shared), control_stops)?;
         let queryables = queryables::declare(
             &session,
@@ -300,6 +337,7 @@ impl Node {
             run_id,
             &to_command_server,
             &to_query_server,
+            &to_file_server,
             &shared,
         )?;
         let link_reports = queryables::subscribe_to_link_reports(&session, &car, &shared, clock)?;
@@ -326,9 +364,11 @@ impl Node {
             filter,
             command_server,
             query_server,
+            file_server,
             load,
             shadow,
             publisher,
+            recorder,
             queryables,
             link_reports,
             namesakes,
@@ -363,12 +403,16 @@ impl Node {
         drop(self.stop_control);
         join(self.command_server);
         join(self.query_server);
+        join(self.file_server);
         // The filter ends with the last sender of commands, which the command server held.
         join(self.filter);
         join(self.load);
         join(self.shadow);
         drop(self.stop_publisher);
         join(self.publisher);
+        if let Some(recorder) = self.recorder {
+            recorder.shutdown();
+        }
         drop(self.queryables);
         drop(self.link_reports);
         drop(self.namesakes);
@@ -384,13 +428,13 @@ fn join(thread: JoinHandle<()>) {
     }
 }
 
-/// The answers to `map` and `info`.
+/// The answer to `map`, and that to `info` as it is and encoded.
 fn describe(
     map: &RaceMap,
     source: &dyn Source,
     started: synpf::Stamp,
     run_id: u64,
-) -> Result<(Vec<u8>, Vec<u8>), protocol::CodecError> {
+) -> Result<(Vec<u8>, CarInfo, Vec<u8>), protocol::CodecError> {
     let stamps = Stamps {
         run_id,
         sequence: 1,
@@ -407,7 +451,8 @@ fn describe(
         host: sysinfo::System::host_name().unwrap_or_default(),
     };
     let map = wire::map(&map.name, map.map.grid(), map.raceline.as_deref());
-    Ok((encode(&map, stamps)?, encode(&info, stamps)?))
+    let encoded = encode(&info, stamps)?;
+    Ok((encode(&map, stamps)?, info, encoded))
 }
 
 /// The set to start with.

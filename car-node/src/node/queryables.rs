@@ -17,13 +17,14 @@ use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::shared_state::SharedState;
 use crate::telemetry::throttle::Change;
 
-/// Declares every query and command. The two servers reply to all but the clock's; zenoh's threads never wait.
+/// Declares every query and command. The servers reply to all but the clock's; zenoh's threads never wait.
 pub(super) fn declare(
     session: &Session,
     car: &CarName,
     run_id: u64,
     to_command_server: &Sender<Request>,
     to_query_server: &Sender<Request>,
+    to_file_server: &Sender<Request>,
     shared: &Arc<SharedState>,
 ) -> Result<Vec<Queryable<()>>, NetworkError> {
     let declare = |topic: Topic, callback: Box<dyn Fn(Query) + Send + Sync>| {
@@ -50,9 +51,12 @@ pub(super) fn declare(
         Topic::CmdRelocalize,
         Topic::CmdRates,
         Topic::CmdAuto,
+        Topic::CmdRecord,
+        Topic::Files,
     ] {
         let server = match topic {
             Topic::Map | Topic::Info | Topic::Missing => to_query_server.clone(),
+            Topic::Files => to_file_server.clone(),
             _ => to_command_server.clone(),
         };
         queryables.push(declare(

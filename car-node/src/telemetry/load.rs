@@ -95,7 +95,7 @@ impl Meter {
             scan_jitter: reading.scan_jitter as f32,
             queue_depth: u32::try_from(reading.queued).unwrap_or(u32::MAX),
             drops: drops(&reading, shared.telemetry.dropped()),
-            recorder: None,
+            recorder: shared.recorder.as_ref().map(|recorder| recorder.state()),
         }
     }
 }

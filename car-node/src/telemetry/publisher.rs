@@ -7,10 +7,12 @@ use std::time::Duration;
 
 use crossbeam_channel::{Receiver, TryRecvError};
 use protocol::{CarName, Message, Stamps, Topic, encode};
-use synpf::Stamp;
+use synpf::{Odometry, Scan, Stamp, YawRate};
 use zenoh::{Session, Wait};
 
 use crate::network::{self, NetworkError};
+use crate::recording::{Entry, RosMessage};
+use crate::sensors::TrueMotion;
 use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::queue::Record;
 use crate::telemetry::replay_buffer::ReplayBuffer;
@@ -142,23 +144,25 @@ impl Publisher {
                     self.send(Topic::RecordedHealth, stamp, &message);
                 }
             }
-            Record::Odometry(odometry) => self.send(
-                Topic::RecordedOdometry,
-                self.clock.wall(odometry.stamp),
-                &wire::odometry(&odometry),
-            ),
-            Record::Scan(scan) => {
-                self.send(
-                    Topic::RecordedScan,
-                    self.clock.wall(scan.stamp),
-                    &wire::scan(&scan),
-                );
+            Record::Odometry(odometry) => {
+                let stamp = self.clock.wall(odometry.stamp);
+                self.send(Topic::RecordedOdometry, stamp, &wire::odometry(&odometry));
+                self.record_on_car(|| RosMessage::Odometry(Odometry { stamp, ..odometry }));
             }
-            Record::Truth(truth) => self.send(
-                Topic::RecordedTruth,
-                self.clock.wall(truth.stamp),
-                &wire::truth(&truth),
-            ),
+            Record::YawRate(yaw_rate) => {
+                let stamp = self.clock.wall(yaw_rate.stamp);
+                self.record_on_car(|| RosMessage::YawRate(YawRate { stamp, ..yaw_rate }));
+            }
+            Record::Scan(scan) => {
+                let stamp = self.clock.wall(scan.stamp);
+                self.send(Topic::RecordedScan, stamp, &wire::scan(&scan));
+                self.record_on_car(|| RosMessage::Scan(Scan { stamp, ..scan }));
+            }
+            Record::Truth(truth) => {
+                let stamp = self.clock.wall(truth.stamp);
+                self.send(Topic::RecordedTruth, stamp, &wire::truth(&truth));
+                self.record_on_car(|| RosMessage::Truth(TrueMotion { stamp, ..truth }));
+            }
             Record::Params(params) => self.send(Topic::Params, wall_now(), params.as_ref()),
             Record::Shadow(shadow) => self.send(Topic::Shadow, wall_now(), shadow.as_ref()),
             Record::Load(load) => self.send(Topic::Load, wall_now(), load.as_ref()),
@@ -175,7 +179,22 @@ impl Publisher {
         }
     }
 
-    /// Sends a message. If its stream must be complete, the message is also kept. While the link is too slow, messages for the
+    /// Records sensor data on the car as a ROS 2 message, if the car records.
+    fn record_on_car(&self, message: impl FnOnce() -> RosMessage) {
+        if let Some(recorder) = self
+            .shared
+            .recorder
+            .as_ref()
+            .filter(|recorder| recorder.recording())
+        {
+            recorder.offer(Entry::Ros {
+                at: wall_now().0,
+                message: message(),
+            });
+        }
+    }
+
+    /// Sends a message, and records it if the car records. If its stream must be complete, the message is also kept. While the link is too slow, messages for the
     /// recorder are only kept.
     fn send<M: Message>(&mut self, topic: Topic, sensor: Stamp, message: &M) {
         let Some(stream) = self.streams.get_mut(&topic) else {
@@ -191,6 +210,26 @@ impl Publisher {
             .map_err(|error| error.to_string())
             .and_then(|bytes| {
                 stream.sequence += 1;
+                if let Some(recorder) = self
+                    .shared
+                    .recorder
+                    .as_ref()
+                    .filter(|recorder| recorder.recording())
+                {
+                    recorder.offer(Entry::Message {
+                        topic,
+                        sequence: stream.sequence,
+                        published: stamps.published,
+                        bytes: bytes.clone(),
+                    });
+                }
+                if topic.recorded() {
+                    let rates = self.shared.rates.lock().unwrap_or_else(PoisonError::into_inner);
+                    if !rates.recorded {
+                        // It is for the recorder on the car only.
+                        return Ok(());
+                    }
+                }
                 if topic.recovered() {
                     let mut replay_buffer = self.replay_buffer.lock().unwrap_or_else(PoisonError::into_inner);
                     replay_buffer.keep(topic, stream.sequence, bytes.clone());

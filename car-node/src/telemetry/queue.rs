@@ -8,7 +8,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use maps::Pose;
 use nalgebra::Matrix3;
 use protocol::EventKind;
-use synpf::{Odometry, Scan, Stamp, Twist, WeightedPose};
+use synpf::{Odometry, Scan, Stamp, Twist, WeightedPose, YawRate};
 
 use crate::health::{Proposal, Verdict};
 use crate::sensors::TrueMotion;
@@ -127,6 +127,8 @@ pub enum Record {
     Odometry(Odometry),
     /// A scan, for the recorder.
     Scan(Scan),
+    /// A yaw rate, for the recorder on the car. It is not sent.
+    YawRate(YawRate),
     /// The truth, for the recorder.
     Truth(TrueMotion),
     /// The set in force.

@@ -6,6 +6,7 @@ use protocol::{CommandId, EventKind, Rates};
 use synpf::Stamp;
 
 use crate::health::Proposal;
+use crate::recording::Recorder;
 use crate::sensors::{PoseEstimate, SharedPose};
 use crate::telemetry::counters::Counters;
 use crate::telemetry::queue::{EventPayload, Record, TelemetryQueue};
@@ -28,6 +29,8 @@ pub struct SharedState {
     pub throttle: Mutex<Throttle>,
     /// Name of the shadow set. The command handler starts it; the shadow's thread may drop it.
     pub shadow: Mutex<Option<String>>,
+    /// Records on the car; None on a car without a folder for it.
+    pub recorder: Option<Arc<Recorder>>,
 }
 
 impl Default for SharedState {
@@ -40,6 +43,7 @@ impl Default for SharedState {
             pose: SharedPose::default(),
             throttle: Mutex::default(),
             shadow: Mutex::default(),
+            recorder: None,
         }
     }
 }
@@ -67,6 +71,13 @@ impl SharedState {
     pub fn set_shadow(&self, name: Option<String>) -> Option<String> {
         let mut shadow = self.shadow.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut *shadow, name)
+    }
+
+    /// True while the car records on its own disk.
+    pub fn recording(&self) -> bool {
+        self.recorder
+            .as_ref()
+            .is_some_and(|recorder| recorder.recording())
     }
 
     /// The latest pose estimate; None before the first.

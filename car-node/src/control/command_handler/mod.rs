@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender};
 use maps::Pose;
 use protocol::{
-    Action, Answer, Command, CommandId, EventKind, Header, Outcome, ParamsAction, RatesAction, Reply, Stamps,
-    Topic, decode, encode,
+    Action, Answer, Command, CommandId, EventKind, Header, Outcome, ParamsAction, RatesAction, RecordAction,
+    Reply, Stamps, Topic, decode, encode,
 };
 use synpf::TrackMap;
 
@@ -145,7 +145,7 @@ impl CommandHandler {
             Action::Relocalize(action) => self.relocalize(command, *action),
             Action::Rates(action) => self.apply_rates(command, action),
             Action::Auto(on) => self.set_auto(command, *on),
-            Action::Record(_) => refused("this car has no folder for recordings".into()),
+            Action::Record(action) => self.record(*action),
         };
         if let Outcome::Refused { faults } = &mut outcome {
             faults.iter_mut().for_each(shorten);
@@ -209,6 +209,22 @@ impl CommandHandler {
             self.event(EventKind::RatesChanged { from, to }, Some(command));
         }
         done(None, Reply::Rates(to))
+    }
+
+    /// Starts or ends the recording on the car. The recorder publishes the event.
+    fn record(&self, action: RecordAction) -> Outcome {
+        let Some(recorder) = &self.config.shared.recorder else {
+            return refused("this car has no folder for recordings; start it with --record FOLDER".into());
+        };
+        let state = match action {
+            RecordAction::Get => Ok(recorder.state()),
+            RecordAction::Start => recorder.set_recording(true),
+            RecordAction::Stop => recorder.set_recording(false),
+        };
+        match state {
+            Ok(state) => done(None, Reply::Recorder(state)),
+            Err(fault) => refused(fault),
+        }
     }
 
     fn stale(&self, expected: u64) -> Outcome {

@@ -38,7 +38,7 @@ fn a_recording_on_the_car_is_a_bag_with_every_message() {
     config.record = Some(RecordOptions::new(folder.path().join("recordings"), true));
     let node = Node::start(config).expect("starts");
     let recorder = node.shared().recorder.clone().expect("a recorder");
-    let until = Instant::now() + Duration::from_secs(60);
+    let until = Instant::now() + Duration::from_mins(1);
     while recorder.state().bytes < 300_000 {
         assert!(Instant::now() < until, "{:?}", recorder.state());
         std::thread::sleep(Duration::from_millis(20));

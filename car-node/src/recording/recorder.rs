@@ -21,7 +21,7 @@ const PERIOD: Duration = Duration::from_millis(400);
 /// A sync that takes longer than this is reported, because then a power cut can lose more than a second.
 const SLOW_SYNC: Duration = Duration::from_millis(600);
 /// Time between two reports of slow syncs.
-const SLOW_SYNC_AGAIN: Duration = Duration::from_secs(60);
+const SLOW_SYNC_AGAIN: Duration = Duration::from_mins(1);
 /// After a failure, recording is tried again this often.
 const RETRY: Duration = Duration::from_secs(5);
 /// Most entries that wait: some seconds of all streams, for a disk that stalls.

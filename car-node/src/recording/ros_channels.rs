@@ -135,8 +135,13 @@ fn laser_scan(scan: &Scan) -> LaserScan {
 pub(super) fn definition(of: &str) -> String {
     let mut text = fields(of).to_owned();
     for part in parts(of) {
-        let rule = "=".repeat(80);
-        text += &format!("{rule}\nMSG: {}\n{}", part.replace("/msg/", "/"), fields(part));
+        text.extend([
+            &"=".repeat(80),
+            "\nMSG: ",
+            &part.replace("/msg/", "/"),
+            "\n",
+            fields(part),
+        ]);
     }
     text
 }

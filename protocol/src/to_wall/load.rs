@@ -1,5 +1,7 @@
 //! CPU, memory, latencies and rates of the car's node.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use crate::codec::Payload;
@@ -61,6 +63,24 @@ pub struct RecorderState {
     pub dropped: u64,
     /// Why nothing can be written at present; None when all is well.
     pub error: Option<String>,
+}
+
+impl fmt::Display for RecorderState {
+    /// `recording, file 12; 3.4 of 8.6 GB used, 23.0 GB free`
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let gigabytes = |bytes: u64| bytes as f64 / 1e9;
+        match (self.recording, &self.error) {
+            (true, Some(error)) => write!(f, "recording FAILS: {error}")?,
+            (true, None) => write!(f, "recording, file {}", self.file)?,
+            (false, _) => f.write_str("not recording")?,
+        }
+        let (used, limit, free) = (gigabytes(self.bytes), gigabytes(self.limit), gigabytes(self.free));
+        write!(f, "; {used:.2} of {limit:.1} GB used, {free:.1} GB free")?;
+        match self.dropped {
+            0 => Ok(()),
+            dropped => write!(f, "; {dropped} messages not recorded"),
+        }
+    }
 }
 
 impl RecorderState {

@@ -143,14 +143,40 @@ pub(crate) enum Verb {
         #[arg(long, value_name = "TIME", default_value = "10m", allow_hyphen_values = true, value_parser = duration)]
         wait: Duration,
     },
-    /// Record all cars into an MCAP file until interrupted.
+    /// Record all cars into an MCAP file until interrupted, or have a car record on its own disk.
     Record {
         /// The new file. Existing files are never overwritten.
-        #[arg(short, long, value_name = "FILE")]
-        output: PathBuf,
+        #[arg(short, long, value_name = "FILE", required_unless_present = "on_car")]
+        output: Option<PathBuf>,
+        #[command(flatten)]
+        on_car: OnCar,
         /// Stop after this time.
         #[arg(long = "for", value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
         time: Option<Duration>,
+    },
+    /// Copy a car's own recordings to this laptop. Goes on where the last fetch ended.
+    Fetch {
+        /// The car.
+        car: CarName,
+        /// Folder for the copies [default: a folder with the car's name]
+        #[arg(long, value_name = "FOLDER")]
+        to: Option<PathBuf>,
+        /// Most bytes per second, such as 500k or 4M.
+        #[arg(long, value_name = "BYTES", default_value = "2M", allow_negative_numbers = true, value_parser = byte_rate)]
+        rate: f64,
+        /// Only recordings with a higher number.
+        #[arg(long, value_name = "NUMBER", default_value_t = 0)]
+        after: u64,
+    },
+    /// Merge recordings of a session, from laptops and from cars, into one file without doubles. The exit code is 7 if
+    /// something is missing in it.
+    Merge {
+        /// The recordings, or folders of them.
+        #[arg(required = true, value_name = "FILE|FOLDER")]
+        inputs: Vec<PathBuf>,
+        /// The new file. Existing files are never overwritten.
+        #[arg(short, long, value_name = "FILE")]
+        output: PathBuf,
     },
     /// Serve the page from a recording.
     Replay {
@@ -247,6 +273,19 @@ pub(crate) enum ParamsVerb {
 }
 
 #[derive(Debug, Args)]
+pub(crate) struct OnCar {
+    /// Have this car record on its own disk. It goes on until it is stopped, over restarts, too.
+    #[arg(long, value_name = "CAR", conflicts_with_all = ["output", "time"])]
+    pub(crate) on_car: Option<CarName>,
+    /// With --on-car: end the recording.
+    #[arg(long, requires = "on_car")]
+    pub(crate) stop: bool,
+    /// With --on-car: only show the state.
+    #[arg(long, requires = "on_car", conflicts_with = "stop")]
+    pub(crate) state: bool,
+}
+
+#[derive(Debug, Args)]
 pub(crate) struct Change {
     /// Fall back after this time unless the change is confirmed.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true, value_parser = duration)]
@@ -311,6 +350,20 @@ fn duration(text: &str) -> Result<Duration, String> {
         _ => return Err(format!("unknown unit {unit:?}; use ms, s, m or h")),
     };
     Duration::try_from_secs_f64(number * scale).map_err(|_| "a time must be 0 s or more".to_owned())
+}
+
+/// Bytes per second: `500k`, `4M`, or a number.
+fn byte_rate(text: &str) -> Result<f64, String> {
+    let units = [("k", 1e3), ("M", 1e6)];
+    let found = units
+        .iter()
+        .find_map(|(unit, scale)| Some((text.strip_suffix(unit)?, *scale)));
+    let (number, scale) = found.unwrap_or((text, 1.0));
+    let number: Option<f64> = number.parse().ok();
+    number
+        .map(|number| number * scale)
+        .filter(|rate| (1e3..=1e9).contains(rate))
+        .ok_or_else(|| format!("{text:?} is not a rate from 1k to 1000M bytes per second"))
 }
 
 /// Updates per second.

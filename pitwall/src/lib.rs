@@ -71,13 +71,14 @@ pub use fleet::{
 };
 pub use fleet_service::{FleetService, StartRecordingError};
 pub use network::{
-    Client, Connection, ConnectionError, DEFAULT_LISTEN, LOCAL_PITWALL, REPLY_TIMEOUT, Role, Verdict,
-    new_command_id,
+    CarFiles, Client, Connection, ConnectionError, DEFAULT_LISTEN, LOCAL_PITWALL, REPLY_TIMEOUT, Role,
+    Verdict, new_command_id,
 };
 pub use program::program;
 pub use recording::{
-    Damage, Recorder, RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary,
-    Recovered, StreamSummary, Unreadable, UnreadableCount, read_events, recover,
+    Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, Merged, MergedInput, Recorder,
+    RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered, StreamSummary,
+    Unreadable, UnreadableCount, fetch, merge, read_events, recover,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -2,12 +2,13 @@
 //!
 //! It gives pit walls and cars on private loopback endpoints, and two kinds of car: [`FakeCar`], which only speaks the
 //! protocol, and [`start_real`], a whole node on a simulated track. It also writes a bag of a drive through a small room
-//! ([`write_bag`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
+//! ([`write_bag`]), has a link that can be cut ([`Link`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
 //! deadline ([`wait_until`]).
 
 #[cfg(feature = "browser")]
 mod browser;
 mod fake_car;
+mod link;
 mod real_car;
 mod steal_time;
 mod synthetic_bag;
@@ -15,7 +16,8 @@ mod synthetic_bag;
 #[cfg(feature = "browser")]
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
-pub use real_car::start_real;
+pub use link::Link;
+pub use real_car::{start_real, start_recording};
 pub use steal_time::steal_time;
 pub use synthetic_bag::{room, true_pose, write_bag};
 

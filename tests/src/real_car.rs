@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
+use car_node::recording::RecordOptions;
 use car_node::sensors::Race;
 use protocol::CarName;
 use simulator::{CarSetup, Track};
@@ -13,6 +14,17 @@ use synpf::TrackMap;
 /// Starts a car at `start` \[m\] along the line of `club`. It connects to the pit wall at `endpoint` and keeps its state in
 /// the folder `state`.
 pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Path>) -> Node {
+    start_recording(name, start, endpoint, state, None)
+}
+
+/// The same, and the car records on its own disk into the folder `record`.
+pub fn start_recording(
+    name: &CarName,
+    start: f64,
+    endpoint: &str,
+    state: Option<&Path>,
+    record: Option<&Path>,
+) -> Node {
     let track = Track::find("club", None).expect("bundled");
     let map = RaceMap {
         name: track.name.clone(),
@@ -28,5 +40,6 @@ pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Pat
     config.start = Start::Truth;
     config.connect = vec![endpoint.to_owned()];
     config.state = state.map(Path::to_owned);
+    config.record = record.map(|folder| RecordOptions::new(folder.to_owned(), true));
     Node::start(config).expect("a car")
 }

@@ -124,6 +124,9 @@ pub(super) async fn report(
             Some(Reply::Rates(rates)) => {
                 output::print(&rates.to_string());
             }
+            Some(Reply::Recorder(state)) => {
+                output::print(&format!("{car}: {state}"));
+            }
             _ => {}
         }
         let text = verdict.text(car);

@@ -4,6 +4,8 @@ mod cars;
 mod control;
 mod events;
 mod export;
+mod fetch;
+mod merge;
 mod params;
 mod record;
 mod replay;
@@ -16,7 +18,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use pitwall::{FleetService, PageOptions, Role, Unreadable};
-use protocol::CarName;
+use protocol::{Action, CarName, RecordAction};
 
 use crate::cli::{Cli, NetworkOptions, Verb};
 use crate::output;
@@ -62,7 +64,20 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let patience = if follow { wait } else { FIND };
             events::run(&network, car, follow, patience, json).await
         }
-        Verb::Record { output, time } => record::record(&network, &output, time, json).await,
+        Verb::Record { output, on_car, time } => match (on_car.on_car, output) {
+            (Some(car), _) => {
+                let action = match (on_car.stop, on_car.state) {
+                    (true, _) => RecordAction::Stop,
+                    (false, true) => RecordAction::Get,
+                    (false, false) => RecordAction::Start,
+                };
+                control::send_command(&network, &car, Action::Record(action), None, json).await
+            }
+            (None, Some(output)) => record::record(&network, &output, time, json).await,
+            (None, None) => Err(BadUsage("record needs --output or --on-car".to_owned()).into()),
+        },
+        Verb::Fetch { car, to, rate, after } => fetch::run(&network, &car, to, rate, after, json).await,
+        Verb::Merge { inputs, output } => merge::run(&inputs, &output, json),
         Verb::Replay { file, speed, at } => {
             let options = PageOptions {
                 address: page.address,

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use protocol::{
-    Action, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, Header, Key,
-    LinkReport, MapReply, Message, Topic, decode, encode,
+    Action, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, FilesReply,
+    FilesRequest, Header, Key, LinkReport, MapReply, Message, Topic, decode, encode,
 };
 use tokio::sync::mpsc;
 use zenoh::qos::Priority;
@@ -16,6 +16,7 @@ use super::query::{CONGESTION, OPERATOR_PRIORITY, first_reply, query, stamps};
 use super::verdict::Verdict;
 use crate::clock::unix_now;
 use crate::event::{EventPayload, EventSink, FleetEvent};
+use crate::recording::FileSource;
 
 /// How long a car may take to reply: as long as a link may be silent before it counts as cut.
 pub const REPLY_TIMEOUT: Duration = Duration::from_secs(4);
@@ -32,6 +33,25 @@ pub fn new_command_id() -> CommandId {
     // The keys of a RandomState come from the operating system's random numbers.
     let random = || u128::from(RandomState::new().build_hasher().finish());
     CommandId(random() << 64 | (random() ^ unix_now() as u128))
+}
+
+/// The recordings on one car. Requests have the lowest priority, and so have the replies.
+pub struct CarFiles<'a> {
+    client: &'a Client,
+    car: CarName,
+}
+
+impl FileSource for CarFiles<'_> {
+    async fn request(&self, request: FilesRequest, timeout: Duration) -> Option<FilesReply> {
+        let Self { client, car } = self;
+        let request = encode(&request, stamps()).ok()?;
+        let priority = Priority::Background;
+        let bytes = first_reply(&client.session, car, Topic::Files, request, timeout, priority).await?;
+        decode::<FilesReply>(&bytes)
+            .inspect_err(|error| tracing::debug!(%car, %error, "the reply cannot be decoded"))
+            .map(|(_, reply)| reply)
+            .ok()
+    }
 }
 
 /// Sends queries and commands to the cars.
@@ -191,6 +211,14 @@ impl Client {
         let (offset, round_trip) = reply.offset_and_round_trip(unix_now());
         self.emit(car, EventPayload::Clock { offset, round_trip });
         Some((offset, round_trip))
+    }
+
+    /// The recordings on a car.
+    pub fn files_of(&self, car: &CarName) -> CarFiles<'_> {
+        CarFiles {
+            client: self,
+            car: car.clone(),
+        }
     }
 
     /// Sends a car how late its poses arrive. A lost report is followed by the next.

@@ -22,7 +22,7 @@ mod role;
 mod run_gate;
 mod verdict;
 
-pub use client::{Client, REPLY_TIMEOUT, new_command_id};
+pub use client::{CarFiles, Client, REPLY_TIMEOUT, new_command_id};
 pub use connection::Connection;
 pub use error::ConnectionError;
 pub(crate) use role::endpoint;

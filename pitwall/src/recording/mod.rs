@@ -18,7 +18,9 @@
 //!
 //! The log time is the arrival by the laptop's clock, the publish time is the car's.
 mod error;
+pub(crate) mod fetch;
 mod foxglove;
+mod merge;
 mod note;
 mod reader;
 mod recorder;
@@ -29,6 +31,8 @@ mod unreadable;
 mod writer;
 
 pub use error::RecordingError;
+pub use fetch::{FetchError, FetchOptions, FetchProgress, Fetched, FileSource, fetch};
+pub use merge::{Merged, MergedInput, merge};
 pub use reader::{Recording, read_events};
 pub use recorder::{Recorder, RecorderStatus, RecordingProgress};
 pub use recover::{Damage, Recovered, recover};

@@ -28,6 +28,10 @@ pub struct Recording {
     progress: Progress,
     /// Channels that are skipped.
     skipped: BTreeSet<String>,
+    /// The program that made the file.
+    library: String,
+    /// Damaged places are passed over, and noted here; None: they are errors.
+    passed_over: Option<Vec<String>>,
 }
 
 #[derive(PartialEq)]
@@ -49,7 +53,16 @@ pub fn read_events(path: &Path) -> Result<Recording, RecordingError> {
         channels: BTreeMap::new(),
         progress: Progress::Data,
         skipped: BTreeSet::new(),
+        library: String::new(),
+        passed_over: None,
     })
+}
+
+/// Opens a recording to read what is intact: damaged places are passed over, and so is a missing end.
+pub(super) fn read_intact(path: &Path) -> Result<Recording, RecordingError> {
+    let mut recording = read_events(path)?;
+    recording.passed_over = Some(Vec::new());
+    Ok(recording)
 }
 
 /// Opens a file that begins as an MCAP file does.
@@ -79,10 +92,23 @@ impl Iterator for Recording {
 }
 
 impl Recording {
+    /// The program that made the file; empty before the first event.
+    pub(super) fn library(&self) -> &str {
+        &self.library
+    }
+
+    /// The damaged places that were passed over.
+    pub(super) fn damage(&self) -> &[String] {
+        self.passed_over.as_deref().unwrap_or_default()
+    }
+
     /// The next event; None at the end of a complete recording.
     fn next_event(&mut self) -> Result<Option<FleetEvent>, RecordingError> {
         while self.progress != Progress::Done {
-            match self.next_record()? {
+            let Some(record) = self.next_record()? else {
+                return Ok(None);
+            };
+            match record {
                 Salvaged::Channel(channel) if self.progress == Progress::Data => {
                     self.channels.insert(channel.id, channel);
                 }
@@ -93,26 +119,43 @@ impl Recording {
                 }
                 Salvaged::DataEnd => self.progress = Progress::Summary,
                 Salvaged::Complete => return Ok(None),
-                Salvaged::Damage(reason) => return Err(RecordingError::broken(&self.path, reason)),
+                Salvaged::Damage(reason) => match &mut self.passed_over {
+                    Some(passed_over) => passed_over.push(reason),
+                    None => return Err(RecordingError::broken(&self.path, reason)),
+                },
+                Salvaged::Header { library, .. } => self.library = library,
                 _ => {}
             }
         }
         Ok(None)
     }
 
-    fn next_record(&mut self) -> Result<Salvaged, RecordingError> {
+    /// The next record; None at an end that is missing and passed over.
+    fn next_record(&mut self) -> Result<Option<Salvaged>, RecordingError> {
         if self.records.is_empty() {
             let records = self.salvage.next(true);
             self.records = records.map_err(|e| RecordingError::io(&self.path, e))?.into();
         }
-        let cut_off = || RecordingError::broken(&self.path, "the file was cut off".to_owned());
-        self.records.pop_front().ok_or_else(cut_off)
+        match (self.records.pop_front(), &self.passed_over) {
+            (None, None) => Err(RecordingError::broken(
+                &self.path,
+                "the file was cut off".to_owned(),
+            )),
+            (record, _) => Ok(record),
+        }
     }
 
     /// The event that a message holds; None for one that is for other programs.
     fn event(&mut self, header: &MessageHeader, data: &[u8]) -> Result<Option<FleetEvent>, RecordingError> {
         let Some(channel) = self.channels.get(&header.channel_id) else {
             let reason = format!("a message is on the unknown channel {}", header.channel_id);
+            if let Some(passed_over) = &mut self.passed_over {
+                // The channel was defined in a damaged chunk.
+                if passed_over.last() != Some(&reason) {
+                    passed_over.push(reason);
+                }
+                return Ok(None);
+            }
             return Err(RecordingError::broken(&self.path, reason));
         };
         let decoded = if channel.message_encoding == WIRE_ENCODING {

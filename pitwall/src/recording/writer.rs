@@ -159,6 +159,11 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.writer.attach(attachment)
     }
 
+    /// Messages and notes written so far.
+    pub(super) fn messages(&self) -> u64 {
+        self.messages
+    }
+
     /// Flushes everything written so far to the file.
     pub(super) fn flush(&mut self) -> Result<(), mcap::McapError> {
         self.writer.flush()

@@ -48,6 +48,7 @@ use crate::event_bus::EventBus;
 use crate::fleet_service::FleetService;
 use crate::replay::Replay;
 use analysis::Sessions;
+pub(crate) use disk::free as free_space;
 use guard::Guard;
 use operators::Operators;
 use tracks::Tracks;

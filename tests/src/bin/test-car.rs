@@ -1,8 +1,8 @@
 //! Cars in a process of their own, which a test can kill as a power cut does.
 //!
 //! ```text
-//! test-car race NAME START ENDPOINT [STATE]   a real node in a simulated car on the bundled track; STATE is the folder
-//!                                             that its sets are kept in
+//! test-car race NAME START ENDPOINT [STATE [RECORDINGS]]   a real node in a simulated car on the bundled track; STATE is the folder
+//!                                             that its sets are kept in, RECORDINGS that of the recordings on the car
 //! test-car rings COUNT ENDPOINT               fake cars, car-1 to car-COUNT, at full rate
 //! ```
 
@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use protocol::CarName;
-use system_tests::{Behaviour, FakeCar, start_real};
+use system_tests::{Behaviour, FakeCar, start_recording};
 
 /// The process ends after this time, in case the test was killed.
 const LONGEST: Duration = Duration::from_mins(10);
@@ -20,21 +20,28 @@ fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match arguments[..] {
-        ["race", name, start, endpoint] => race(name, start.parse().context("START")?, endpoint, None),
-        ["race", name, start, endpoint, state] => race(
+        ["race", name, start, endpoint] => race(name, start.parse().context("START")?, endpoint, None, None),
+        ["race", name, start, endpoint, state, ref record @ ..] if record.len() <= 1 => race(
             name,
             start.parse().context("START")?,
             endpoint,
             Some(Path::new(state)),
+            record.first().map(Path::new),
         ),
         ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint),
-        _ => bail!("usage: test-car race NAME START ENDPOINT [STATE] | rings COUNT ENDPOINT"),
+        _ => bail!("usage: test-car race NAME START ENDPOINT [STATE [RECORDINGS]] | rings COUNT ENDPOINT"),
     }
 }
 
 /// A car that starts at `start` \[m\] along the raceline.
-fn race(name: &str, start: f64, endpoint: &str, state: Option<&Path>) -> anyhow::Result<()> {
-    let node = start_real(&CarName::new(name)?, start, endpoint, state);
+fn race(
+    name: &str,
+    start: f64,
+    endpoint: &str,
+    state: Option<&Path>,
+    record: Option<&Path>,
+) -> anyhow::Result<()> {
+    let node = start_recording(&CarName::new(name)?, start, endpoint, state, record);
     std::thread::sleep(LONGEST);
     node.shutdown("the test is over");
     Ok(())

@@ -230,9 +230,18 @@ impl Node {
                     map: map_message.clone(),
                     info,
                 };
-                RecorderThread::prepare(options, head)
+                let asked_for = options.start;
+                match RecorderThread::prepare(options, head) {
+                    Err(error) if !asked_for => {
+                        // A car that was not told to record runs without a place for it.
+                        tracing::warn!(%error, "this car cannot record");
+                        Ok(None)
+                    }
+                    outcome => outcome.map(Some),
+                }
             })
-            .transpose()?;
+            .transpose()?
+            .flatten();
         let (recorder, launch) = recorder.unzip();
         let shared = Arc::new(SharedState {
             rates: Mutex::new(rates),

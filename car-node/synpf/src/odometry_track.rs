@@ -224,9 +224,10 @@ impl OdometryTrack {
         }
     }
 
-    /// Speed of the wheels by the last message [m/s].
-    pub(crate) fn wheel_speed(&self) -> f64 {
-        self.last.map_or(0.0, |last| last.twist.linear_x)
+    /// Speed of the car by the last message [m/s]: that of the wheels, unless they slide.
+    pub(crate) fn speed(&self) -> f64 {
+        let wheels = self.last.map_or(0.0, |last| last.twist.linear_x);
+        self.grip.sliding_speed().unwrap_or(wheels)
     }
 
     /// Whether the wheels slide, so that the car's own speed is carried on.

@@ -194,6 +194,37 @@ fn wheels_that_lock_do_not_stop_the_pose() {
     assert!(said);
 }
 
+/// Scans were taken to stand still like the wheels: 3 m behind, and lost.
+#[test]
+fn wheels_that_lock_on_a_car_that_rolls_on_do_not_stop_the_pose() {
+    let locked = |t: f64| (3.0..4.0).contains(&t) || (5.5..6.5).contains(&t);
+    let twist = move |t: f64| {
+        let twist = odometry(t, 1.0).twist;
+        let wheels = if locked(t) { 0.0 } else { 1.0 };
+        Twist {
+            linear_x: twist.linear_x * wheels,
+            linear_y: twist.linear_y * wheels,
+            ..twist
+        }
+    };
+    let sensors = wheels(move |t, message| {
+        let mut pose = Pose::IDENTITY;
+        for step in 0..(t / 0.02).round() as u32 {
+            let Twist {
+                linear_x,
+                linear_y,
+                angular,
+            } = twist(f64::from(step) * 0.02);
+            pose = pose * Pose::exp([linear_x, linear_y, angular].map(|v| v * 0.02));
+        }
+        (message.pose, message.twist) = (pose, twist(t));
+    });
+    let outcomes = drive(&sensors, 7.5);
+    assert!(worst(&outcomes) < 0.1, "{}", worst(&outcomes));
+    let held = updates(&outcomes).any(|(_, update)| update.sensors.get(SensorFinding::Creep).is_some());
+    assert!(!held);
+}
+
 /// Frozen scans under new stamps were fitted like any other, and the pose stood still with them.
 #[test]
 fn scans_that_repeat_are_no_scans() {

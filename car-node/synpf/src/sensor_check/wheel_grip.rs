@@ -108,6 +108,11 @@ impl WheelGrip {
         self.sliding.is_some()
     }
 
+    /// The car's speed while the wheels slide [m/s].
+    pub(crate) fn sliding_speed(&self) -> Option<f64> {
+        self.sliding.map(|sliding| sliding.car)
+    }
+
     /// The scans say that the car drives at `speed` [m/s]; `share` of it is to be believed, in [0, 1].
     pub(crate) fn correct(&mut self, speed: f64, share: f64) {
         if let Some(sliding) = &mut self.sliding

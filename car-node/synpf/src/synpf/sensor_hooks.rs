@@ -36,7 +36,7 @@ impl SynPf {
         let (max_range, beams) = (self.parameters.sensor.max_range, &self.parameters.beams);
         self.scan
             .load((scan, geometry), &self.odometry, slip, laser, max_range, beams)?;
-        let (driven, speed) = (self.odometry.driven_sums(), self.odometry.wheel_speed());
+        let (driven, speed) = (self.odometry.driven_sums(), self.odometry.speed());
         self.odometry.corrections.standing = self.sensors.stands(scan, geometry, laser, &driven, speed);
         self.as_sweep.points.clear();
         if self.mode == Mode::Tracking

@@ -60,6 +60,7 @@ mod correlative_match;
 mod error;
 mod estimate;
 mod global_search;
+mod innovation_gate;
 mod likelihood_field;
 mod motion_model;
 mod normal_pool;

@@ -29,7 +29,7 @@ use crate::received::CARRY;
 use crate::recovery::{Decision, Evidence, Recovery};
 use crate::sensor_check::SensorCheck;
 use crate::track_map::TrackMap;
-use crate::tracker::{Tracker, Uncertainty, fit_scan};
+use crate::tracker::{Tracker, Uncertainty};
 use crate::tuning::Tuning;
 
 /// SynPF. One thread owns it; the map is shared.
@@ -224,12 +224,10 @@ impl SynPf {
         } = self;
         let (field, points) = (self.map.field(), &self.scan.points);
         let before = self.tracker.estimate;
-        let seen = self.tracker.predicted_covariance(predicted);
-        let fit = fit_scan(
+        let fit = self.tracker.fit_scan(
             field,
             points,
             predicted,
-            &seen,
             weighted,
             calibration.walls,
             &parameters.refinement,
@@ -242,7 +240,12 @@ impl SynPf {
 
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
-        if learns_slip(parameters) && fit.from_prediction && !self.odometry.wheels_slide() {
+        let refused = fit.refused.map(|pose| pose.since(predicted.pose));
+        self.tracker.gate.note_refused(refused, step.motion.x);
+        if !fit.held {
+            self.tracker.gate.learn_fit(fit.on_walls, step.motion.x);
+        }
+        if learns_slip(parameters) && fit.from_prediction && !fit.held && !self.odometry.wheels_slide() {
             calibration.slip_model.learn(predicted, &estimate);
         } else {
             calibration.slip_model.forget_pose();
@@ -255,7 +258,9 @@ impl SynPf {
         } else {
             0.0
         };
-        calibration.learn_walls(field, points, &estimate, step.motion.x, distance);
+        if !fit.held {
+            calibration.learn_walls(field, points, &estimate, step.motion.x, distance);
+        }
         self.learn_sensors(step, predicted, moved);
         refined.then(|| estimate.pose.since(predicted.pose))
     }
@@ -329,8 +334,12 @@ impl SynPf {
         quality: &Quality,
     ) -> Update {
         self.number += 1;
-        let (map_from_grid, doubt) = (self.map.grid().origin, self.recovery.doubt());
+        let map_from_grid = self.map.grid().origin;
         let mut estimate = self.tracker.posterior();
+        let doubt = self
+            .recovery
+            .doubt()
+            .or_else(|| self.tracker.gate.doubt(estimate.pose));
         if let Some(doubt) = doubt {
             estimate.covariance = doubt.widened(&estimate);
         }

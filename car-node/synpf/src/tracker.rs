@@ -9,6 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::calibration::WallCalibration;
 use crate::estimate::Estimate;
+use crate::innovation_gate::InnovationGate;
 use crate::motion_model::MotionParameters;
 use crate::particle_filter::Weighted;
 use crate::scan_matcher::{RefinementParameters, ScanMatch, fit as share_on_walls, match_scan};
@@ -25,6 +26,8 @@ pub(crate) struct Tracker {
     pub(crate) sweep_error: Matrix3<f64>,
     /// When it is true, and odometry's pose then; None until it is known.
     pub(crate) at: Option<(Stamp, Pose)>,
+    /// Which corrections are believed.
+    pub(crate) gate: InnovationGate,
 }
 
 /// What the fit of a scan came to.
@@ -35,6 +38,12 @@ pub(crate) struct Fit {
     pub(crate) covariance: Matrix3<f64>,
     /// Whether it started from the prediction; else from the particles.
     pub(crate) from_prediction: bool,
+    /// A pose that the scan fits better at, but where the car can hardly be.
+    pub(crate) refused: Option<Pose>,
+    /// Whether the whole scan was left out for that.
+    pub(crate) held: bool,
+    /// Share of the end points that lie on walls there, in [0, 1].
+    pub(crate) on_walls: f64,
 }
 
 /// How far odometry may have gone wrong between two scans.
@@ -73,6 +82,7 @@ impl Tracker {
             covariance: estimate.covariance,
             sweep_error: Matrix3::zeros(),
             at: None,
+            gate: InnovationGate::default(),
         }
     }
 
@@ -81,6 +91,7 @@ impl Tracker {
         self.estimate = estimate;
         self.covariance = estimate.covariance;
         self.sweep_error = Matrix3::zeros();
+        self.gate = InnovationGate::default();
     }
 
     /// The pose with what is known of its uncertainty.
@@ -124,6 +135,79 @@ impl Tracker {
         let grown = predicted.covariance - carried(self.estimate.covariance);
         carried(self.covariance) + grown
     }
+
+    /// The scan fitted around the prediction, or around the particles where they explain it better.
+    pub(crate) fn fit_scan(
+        &self,
+        field: &DistanceField,
+        points: &[[f32; 2]],
+        predicted: &Estimate,
+        weighted: &Weighted,
+        walls: WallCalibration,
+        parameters: &RefinementParameters,
+    ) -> Fit {
+        let seen = &self.predicted_covariance(predicted);
+        let particles = Estimate {
+            pose: weighted.particles.mean,
+            covariance: weighted.particles.covariance,
+        };
+        let on_walls = |estimate: &Estimate| share_on_walls(field, points, 60, estimate.pose, FIT_REACH);
+        let fit = |found: ScanMatch, from_prediction, on_walls| Fit {
+            estimate: found.estimate,
+            covariance: found.covariance,
+            from_prediction,
+            refused: None,
+            held: false,
+            on_walls,
+        };
+        let passes = |found: &Estimate, on_walls| self.gate.passes(predicted, seen, found.pose, on_walls);
+        let unchanged = |estimate: Estimate| ScanMatch {
+            estimate,
+            covariance: estimate.covariance,
+        };
+        if !parameters.refine || !weighted.sound {
+            return fit(unchanged(particles), false, 0.0);
+        }
+        let matched =
+            |prior: &Estimate, seen| match_scan(field, points, prior.pose, prior, seen, walls, parameters);
+        let from_predicted = matched(predicted, seen);
+        let (before, after) = (on_walls(predicted), on_walls(&from_predicted.estimate));
+        let mut refused = None;
+        if on_walls(&particles) > before.max(after) + FIT_MARGIN {
+            let covariance = particles.covariance + Matrix3::identity() * 1e-4;
+            let around = Estimate {
+                covariance,
+                ..particles
+            };
+            let from_particles = matched(&around, &covariance);
+            let share = on_walls(&from_particles.estimate);
+            if share > after + FIT_MARGIN {
+                if passes(&from_particles.estimate, share) {
+                    return fit(from_particles, false, share);
+                }
+                refused = Some(from_particles.estimate.pose);
+            }
+        }
+        let kept = ScanMatch {
+            estimate: *predicted,
+            covariance: *seen,
+        };
+        if !passes(&from_predicted.estimate, after) {
+            let refused = refused.or(Some(from_predicted.estimate.pose));
+            return Fit {
+                refused,
+                held: true,
+                ..fit(kept, true, before)
+            };
+        }
+        // A fit that made things worse has run away.
+        let fit = if after + FIT_MARGIN < before {
+            fit(kept, true, before)
+        } else {
+            fit(from_predicted, true, after)
+        };
+        Fit { refused, ..fit }
+    }
 }
 
 /// Mean and covariance of all places on the map that may hold a car, at any heading.
@@ -146,60 +230,6 @@ fn anywhere(map: &TrackMap) -> Estimate {
     Estimate {
         pose: Pose::new((x + 0.5) * resolution, (y + 0.5) * resolution, 0.0),
         covariance: Matrix3::new(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, heading),
-    }
-}
-
-/// The scan fitted around the prediction, or around the particles where they explain it better.
-pub(crate) fn fit_scan(
-    field: &DistanceField,
-    points: &[[f32; 2]],
-    predicted: &Estimate,
-    seen: &Matrix3<f64>,
-    weighted: &Weighted,
-    walls: WallCalibration,
-    parameters: &RefinementParameters,
-) -> Fit {
-    let particles = Estimate {
-        pose: weighted.particles.mean,
-        covariance: weighted.particles.covariance,
-    };
-    let fit = |found: ScanMatch, from_prediction| Fit {
-        estimate: found.estimate,
-        covariance: found.covariance,
-        from_prediction,
-    };
-    let unchanged = |estimate: Estimate| ScanMatch {
-        estimate,
-        covariance: estimate.covariance,
-    };
-    if !parameters.refine || !weighted.sound {
-        return fit(unchanged(particles), false);
-    }
-    let on_walls = |estimate: &Estimate| share_on_walls(field, points, 60, estimate.pose, FIT_REACH);
-    let matched =
-        |prior: &Estimate, seen| match_scan(field, points, prior.pose, prior, seen, walls, parameters);
-    let from_predicted = matched(predicted, seen);
-    let (before, after) = (on_walls(predicted), on_walls(&from_predicted.estimate));
-    if on_walls(&particles) > before.max(after) + FIT_MARGIN {
-        let covariance = particles.covariance + Matrix3::identity() * 1e-4;
-        let around = Estimate {
-            covariance,
-            ..particles
-        };
-        let from_particles = matched(&around, &covariance);
-        if on_walls(&from_particles.estimate) > after + FIT_MARGIN {
-            return fit(from_particles, false);
-        }
-    }
-    // A fit that made things worse has run away.
-    if after + FIT_MARGIN < before {
-        let kept = ScanMatch {
-            estimate: *predicted,
-            covariance: *seen,
-        };
-        fit(kept, true)
-    } else {
-        fit(from_predicted, true)
     }
 }
 
@@ -250,6 +280,7 @@ mod tests {
             covariance: Matrix3::zeros(),
             sweep_error: Matrix3::zeros(),
             at: None,
+            gate: InnovationGate::default(),
         };
         for step in 0..steps {
             let yaw_rate = if 2 * step < steps { 1.5 } else { -1.5 };

@@ -225,6 +225,38 @@ fn wheels_that_lock_on_a_car_that_rolls_on_do_not_stop_the_pose() {
     assert!(!held);
 }
 
+/// Patches of 2 m in which the barrier is a net, and the laser sees spectators half a metre behind it: the pose leapt to where
+/// they stood on walls.
+#[test]
+fn people_behind_nets_do_not_move_the_pose() {
+    // In [0, 1), the same for all of a cell.
+    let hash = |x: f64, y: f64, cell: f64| {
+        let (i, j) = ((x / cell).floor(), (y / cell).floor());
+        ((i * 12.9898 + j * 78.233).sin() * 43_758.547).rem_euclid(1.0)
+    };
+    let outcomes = drive(
+        &Sensors {
+            scan: Box::new(move |t, message| {
+                let laser = truth(t) * BASE_LINK_FROM_LASER;
+                for (i, range) in message.ranges.iter_mut().enumerate() {
+                    let angle = message.angle_min + message.angle_increment * i as f64;
+                    let (sin, cos) = (laser.heading + angle).sin_cos();
+                    let (x, y) = (
+                        laser.x + f64::from(*range) * cos,
+                        laser.y + f64::from(*range) * sin,
+                    );
+                    if t > 2.0 && hash(x, y, 2.0) < 0.4 {
+                        *range += (0.6 + 0.36 * hash(x, y, 0.3)) as f32;
+                    }
+                }
+            }),
+            ..Sensors::default()
+        },
+        lap(),
+    );
+    assert!(worst(&outcomes) < 0.1, "{}", worst(&outcomes));
+}
+
 /// Frozen scans under new stamps were fitted like any other, and the pose stood still with them.
 #[test]
 fn scans_that_repeat_are_no_scans() {

@@ -8,7 +8,6 @@ use crate::correlative_match::seed;
 use crate::motion_model::Motion;
 use crate::particle_estimate::ParticleEstimate;
 use crate::particle_filter::Weighted;
-use crate::tracker::fit_scan;
 
 /// A step of [`SynPf::on_scan`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,11 +78,10 @@ impl SynPf {
                     },
                     sound: true,
                 };
-                std::hint::black_box(fit_scan(
+                std::hint::black_box(self.tracker.fit_scan(
                     self.map.field(),
                     &self.scan.points,
                     estimate,
-                    &self.tracker.covariance,
                     &weighted,
                     self.calibration.walls,
                     &parameters.refinement,

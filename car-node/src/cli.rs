@@ -8,8 +8,8 @@ use car_node::evaluate::Fault;
 use car_node::localization::Start;
 use car_node::network::endpoint;
 use car_node::recording::RecordOptions;
-use car_node::ros2::topics;
 use car_node::sensors::Ros2Options;
+use car_node::sensors::frames::Mount;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
@@ -69,6 +69,10 @@ pub(crate) enum Odometry {
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "each is a switch on the command line"
+)]
 pub(crate) struct Run {
     /// Where the sensor data comes from.
     #[arg(long, value_enum)]
@@ -82,9 +86,17 @@ pub(crate) struct Run {
     /// With --source ros2: the ROS domain [default: $ROS_DOMAIN_ID, else 0].
     #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u32>(text, 0, 232))]
     pub(crate) ros_domain: Option<u32>,
-    /// With --source ros2: topic to publish the pose on for the car's own nodes (nav_msgs/Odometry in frame map).
-    #[arg(long, value_name = "TOPIC", default_value = topics::POSE_ODOMETRY)]
-    pub(crate) pose_topic: String,
+    /// With --source ros2: the car's namespace, where several cars share a router, such as /car1 [default: the first that has a scan
+    /// and odometry].
+    #[arg(long, value_name = "NAMESPACE")]
+    pub(crate) ros_namespace: Option<String>,
+    /// With --source ros2: topic to publish the pose on for the car's own nodes (nav_msgs/Odometry in frame map)
+    /// [default: /pf/pose/odom in the car's namespace].
+    #[arg(long, value_name = "TOPIC")]
+    pub(crate) pose_topic: Option<String>,
+    /// With --source ros2: do not publish the transform from map to odom.
+    #[arg(long)]
+    pub(crate) no_tf: bool,
     /// With --source ros2: topic of initial poses (geometry_msgs/PoseWithCovarianceStamped in frame map) [default: /initialpose
     /// in the namespace of the scan].
     #[arg(long, value_name = "TOPIC")]
@@ -196,9 +208,10 @@ pub(crate) struct TopicArguments {
     /// Gyroscope (sensor_msgs/Imu) [default: by the usual names, else the first, if any].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
-    /// Pose of the laser on base_link [m, m, rad] [default: from /tf_static; 0.27 m ahead without it].
-    #[arg(long, help_heading = TOPICS, value_name = "X,Y,HEADING", value_parser = laser, allow_hyphen_values = true)]
-    pub(crate) laser: Option<Pose>,
+    /// Pose of the laser on base_link [m, m, rad], and whether it is mounted upside down [default: from /tf_static; 0.27 m ahead
+    /// without it].
+    #[arg(long, help_heading = TOPICS, value_name = "X,Y,HEADING[,upside-down]", value_parser = laser, allow_hyphen_values = true)]
+    pub(crate) laser: Option<Mount>,
 }
 
 /// Bags, and the map that they were driven on.
@@ -458,10 +471,17 @@ fn pose(text: &str) -> Result<Pose, String> {
 }
 
 /// `x,y,heading` of a laser.
-fn laser(text: &str) -> Result<Pose, String> {
-    let mount = pose(text)?;
-    if mount.x.hypot(mount.y) < 10.0 {
-        Ok(mount)
+fn laser(text: &str) -> Result<Mount, String> {
+    let (place, upside_down) = match text.rsplit_once(',') {
+        Some((place, word)) if word.trim() == "upside-down" => (place, true),
+        _ => (text, false),
+    };
+    let base_link_from_laser = pose(place)?;
+    if base_link_from_laser.x.hypot(base_link_from_laser.y) < 10.0 {
+        Ok(Mount {
+            base_link_from_laser,
+            upside_down,
+        })
     } else {
         Err("the laser must be within 10 m of base_link".into())
     }

@@ -67,7 +67,10 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
             }
             Feed::Truth(truth) => log.truth.push((truth.stamp, truth.pose)),
             Feed::Log(word) => panic!("{word}"),
-            Feed::InitialPose { .. } | Feed::GlobalSearch { .. } => panic!("the recovery crew had to come"),
+            Feed::InitialPose { .. }
+            | Feed::GlobalSearch { .. }
+            | Feed::Clock { .. }
+            | Feed::Mount { .. } => panic!("the recovery crew had to come"),
         }
     }
     log

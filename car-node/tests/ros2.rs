@@ -14,7 +14,8 @@ use car_node::ros2::messages::{
     self, Header, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, RosPose, TfMessage,
     TransformStamped, Vector3,
 };
-use car_node::ros2::{pose_publisher, topics};
+use car_node::ros2::output_publisher;
+use car_node::ros2::output_publisher::OutputOptions;
 use car_node::sensors::bag::{SensorEvent, Topics};
 use car_node::sensors::clock::wall_now;
 use car_node::sensors::{Feed, Next, PoseEstimate, Race, Ros2, Ros2Error, Ros2Options, Source};
@@ -177,14 +178,7 @@ fn drive(router: &Session, naming: Naming, track: &Track) -> (Drive, Pose) {
 }
 
 fn options(endpoint: &str) -> Ros2Options {
-    Ros2Options {
-        endpoint: endpoint.into(),
-        domain: 0,
-        topics: Topics::default(),
-        initial_pose_topic: None,
-        outputs: vec![topics::POSE_ODOMETRY.into()],
-        mount: None,
-    }
+    Ros2Options::new(endpoint)
 }
 
 /// Localizes on a car's topics, with some faulty messages, and compares with the truth.
@@ -216,17 +210,21 @@ fn localizes(naming: Naming) {
         map: Arc::new(TrackMap::new(track.grid.clone()).expect("free")),
         raceline: None,
     };
-    let (mut pose_sink, mut poses) = (None, None);
-    if let Some(connection) = source.ros_connection() {
-        let key = "0/pf/pose/odom/nav_msgs::msg::dds_::Odometry_/RIHS01_0123";
-        poses = Some(ros_router.declare_subscriber(key).wait().expect("subscribes"));
-        let started = pose_publisher::start(connection.clone(), topics::POSE_ODOMETRY);
-        pose_sink = Some(started.expect("starts").0);
-    }
-    assert_eq!(pose_sink.is_some(), naming == Naming::RmwZenoh);
+    let key = naming.key("pf/pose/odom", "nav_msgs::msg::dds_::Odometry_");
+    let poses = ros_router.declare_subscriber(key).wait().expect("subscribes");
+    let connection = source.ros_connection();
+    let announced = connection.announce().expect("announced");
+    let started = output_publisher::start(
+        connection,
+        &announced,
+        &OutputOptions::default(),
+        "car-1",
+        map.map.grid(),
+    );
+    let ros = started.expect("starts").0;
     let mut config = NodeConfig::new("car-1".parse().expect("a name"), map, Box::new(source));
     config.start = Start::Pose(start);
-    config.pose_sink = pose_sink;
+    config.ros = Some(ros);
     config.connect = vec![wall_endpoint];
     let node = Node::start(config).expect("starts");
     let mut compared = 0;
@@ -264,21 +262,21 @@ fn localizes(naming: Naming) {
         }
     }
     assert!(moved > 0.5, "the car has driven {moved} m");
-    if let Some(poses) = poses {
-        // The controller gets the estimates at odometry rate, with the stamps of the sensors.
-        let poses: Vec<RosOdometry> = poses
-            .drain()
-            .map(|sample| messages::decode(&sample.payload().to_bytes()).expect("a pose"))
-            .collect();
-        assert!(poses.len() > 50, "{}", poses.len());
-        let last = poses.last().expect("many");
-        assert_eq!(
-            (last.header.frame_id.as_str(), last.child_frame_id.as_str()),
-            ("map", "base_link")
-        );
-        assert!(wall_now().since(last.header.stamp.into()) < 5.0);
-        assert!(last.pose.planar().distance(start) > 0.5);
-    }
+    // The controller gets the estimates at odometry rate, with the stamps of the sensors, which never go back.
+    let poses: Vec<RosOdometry> = poses
+        .drain()
+        .map(|sample| messages::decode(&sample.payload().to_bytes()).expect("a pose"))
+        .collect();
+    assert!(poses.len() > 50, "{}", poses.len());
+    let stamps = poses.iter().map(|pose| Stamp::from(pose.header.stamp));
+    assert!(stamps.is_sorted_by(|a, b| a < b));
+    let last = poses.last().expect("many");
+    assert_eq!(
+        (last.header.frame_id.as_str(), last.child_frame_id.as_str()),
+        ("map", "base_link")
+    );
+    assert!(wall_now().since(last.header.stamp.into()) < 5.0);
+    assert!(last.pose.planar().distance(start) > 0.5);
     drive.stop.store(true, Ordering::Relaxed);
     drive.thread.join().expect("drives");
     // A car without sensor data ends as quickly as any other.

@@ -81,12 +81,12 @@ impl Car {
             monitor: Monitor::new(Thresholds::default(), clock.now()),
             base_link_from_laser,
             raceline: None,
-            clock,
+            clock: clock.clone(),
             set: store.reference(),
             predict: true,
             shared: Arc::clone(&shared),
             shadow,
-            pose_sink: None,
+            ros: None,
         };
         let filter = filter_worker::start(config, filter_feed, filter_commands).expect("a thread");
         let handler = CommandHandler::new(CommandHandlerConfig {
@@ -202,7 +202,10 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
                 }
             }
             Feed::Log(_) => {}
-            Feed::InitialPose { .. } | Feed::GlobalSearch { .. } => {
+            Feed::InitialPose { .. }
+            | Feed::GlobalSearch { .. }
+            | Feed::Clock { .. }
+            | Feed::Mount { .. } => {
                 panic!("the recovery crew had to come under {}", CIRCUIT[under])
             }
         }

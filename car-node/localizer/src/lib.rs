@@ -94,6 +94,9 @@ pub trait Localizer: fmt::Debug + Send {
     /// Takes in what a job came to. An outcome that is no longer asked for is ignored.
     fn finish_job(&mut self, _outcome: JobOutcome) {}
 
+    /// The laser is mounted here on `base_link`, other than was known. Holds from the next scan on.
+    fn set_laser(&mut self, base_link_from_laser: Pose);
+
     /// The parameter set in force.
     fn parameters(&self) -> ParameterValues;
 

@@ -75,8 +75,7 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
 
 /// Reads what a localizer needs of a bag.
 fn read_bag(bag: &Path, arguments: &TopicArguments) -> anyhow::Result<SensorLog> {
-    let mount = arguments.laser.map(Mount::upright);
-    let log = Bag::read(bag)?.sensors(&topics(arguments), mount)?;
+    let log = Bag::read(bag)?.sensors(&topics(arguments), arguments.laser)?;
     for note in &log.notes {
         eprintln!("car-node: {}: {note}", bag.display());
     }

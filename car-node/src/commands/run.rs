@@ -9,9 +9,12 @@ use anyhow::{Context, anyhow, bail};
 use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::recording::RecordOptions;
-use car_node::ros2::pose_publisher;
-use car_node::sensors::frames::Mount;
-use car_node::sensors::{BagPlayer, PoseEstimate, Race, Ros2, Ros2Options, Source};
+use car_node::ros2::graph::RosNode;
+use car_node::ros2::output::RosSink;
+use car_node::ros2::output_publisher::{self, OutputOptions, RosConnection};
+use car_node::ros2::services;
+use car_node::ros2::topics;
+use car_node::sensors::{BagPlayer, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use maps::{OccupancyGrid, Raceline};
 use protocol::CarName;
@@ -29,7 +32,7 @@ const DEFAULT_NAME: &str = "car-1";
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let car = name(arguments)?;
     let signal = signals()?;
-    let mut pose_sink = None;
+    let (mut ros, mut ros_sink) = (None, None);
     let (map, source, start): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
         (SourceKind::Bag, Some(bag)) => {
             let mut log = super::read_bag(bag, &arguments.topics)?;
@@ -47,7 +50,12 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             // The map first, so that its faults show without ROS.
             let map = map_file(arguments)?;
             let source = ros2(arguments, &car, &signal)?;
-            pose_sink = pose_for_ros(arguments, &source)?;
+            let connection = source.ros_connection().clone();
+            let ros_node = connection
+                .announce()
+                .map_err(|error| anyhow!("cannot join the ROS graph: {error}"))?;
+            ros_sink = Some(ros_output(arguments, &car, &connection, &ros_node, &map)?);
+            ros = Some((connection, ros_node));
             (map, Box::new(source), Start::Global)
         }
         (SourceKind::Simulator, _) => {
@@ -71,13 +79,16 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     config.connect.clone_from(&arguments.connect);
     config.rates.recorded = !arguments.no_recorded;
     config.predict = arguments.predict;
-    config.pose_sink = pose_sink;
+    config.ros = ros_sink;
     config.state = arguments
         .state
         .clone()
         .or_else(|| default_state_folder(car.as_str()));
     config.record = record_options(arguments, config.state.as_deref());
     let node = Node::start(config)?;
+    let _services = ros
+        .map(|(connection, ros_node)| ros_services(&connection, &ros_node, &node))
+        .transpose()?;
     let wall = if arguments.connect.is_empty() {
         "a pit wall on this machine or nearby".to_owned()
     } else {
@@ -131,10 +142,16 @@ fn ros2(arguments: &Run, car: &CarName, signal: &Receiver<&'static str>) -> anyh
     let options = Ros2Options {
         endpoint: arguments.ros.clone(),
         domain,
+        namespace: arguments.ros_namespace.clone(),
         topics: super::topics(&arguments.topics),
         initial_pose_topic: arguments.initial_pose_topic.clone(),
-        outputs: vec![arguments.pose_topic.clone()],
-        mount: arguments.topics.laser.map(Mount::upright),
+        outputs: arguments
+            .pose_topic
+            .iter()
+            .cloned()
+            .chain(topics::POSES.map(str::to_owned))
+            .collect(),
+        mount: arguments.topics.laser,
     };
     let mut printed = String::new();
     let source = Ros2::find(&options, |missing| {
@@ -144,24 +161,38 @@ fn ros2(arguments: &Run, car: &CarName, signal: &Receiver<&'static str>) -> anyh
         }
         signal.try_recv().is_err()
     })?;
+    for note in source.notes() {
+        eprintln!("{car}: {note}");
+    }
     if source.mount_is_a_guess() {
         super::warn_of_guess("ROS 2");
     }
     Ok(source)
 }
 
-/// Publishes the pose to the car's own nodes. None behind a bridge.
-fn pose_for_ros(arguments: &Run, source: &Ros2) -> anyhow::Result<Option<Sender<PoseEstimate>>> {
-    let Some(ros) = source.ros_connection() else {
-        eprintln!(
-            "car-node: warning: the pose is not published to ROS on {}: behind a bridge that is not possible yet, rmw_zenoh is needed",
-            arguments.pose_topic
-        );
-        return Ok(None);
+/// Publishes to the car's own nodes.
+fn ros_output(
+    arguments: &Run,
+    car: &CarName,
+    connection: &RosConnection,
+    node: &Arc<RosNode>,
+    map: &RaceMap,
+) -> anyhow::Result<RosSink> {
+    let options = OutputOptions {
+        pose_topic: arguments.pose_topic.clone(),
+        transform: !arguments.no_tf,
     };
-    let (pose_sink, _) = pose_publisher::start(ros.clone(), &arguments.pose_topic)
-        .map_err(|error| anyhow!("{}: cannot publish the pose: {error}", arguments.pose_topic))?;
-    Ok(Some(pose_sink))
+    let (sink, _) = output_publisher::start(connection, node, &options, car.as_str(), map.map.grid())
+        .map_err(|error| anyhow!("cannot publish to ROS: {error}"))?;
+    Ok(sink)
+}
+
+/// Starts the node's ROS services. They end when what is returned is dropped.
+fn ros_services(connection: &RosConnection, ros_node: &RosNode, node: &Node) -> anyhow::Result<Sender<()>> {
+    let (stop, stops) = bounded(0);
+    services::start(connection, ros_node, node.local_commands().clone(), stops)
+        .map_err(|error| anyhow!("cannot serve ROS: {error}"))?;
+    Ok(stop)
 }
 
 /// Waits for the end of the node, and returns the reason.

@@ -7,6 +7,7 @@ use crossbeam_channel::{Receiver, select};
 use zenoh::Wait;
 
 use super::command_handler::{CommandHandler, CommandHandlerConfig};
+use super::local_commands::LocalRequest;
 use super::request::Request;
 
 /// The handler's deadlines are checked this often.
@@ -16,6 +17,7 @@ const TICK: Duration = Duration::from_millis(50);
 pub fn start(
     config: CommandHandlerConfig,
     requests: Receiver<Request>,
+    mut local: Receiver<LocalRequest>,
     stop: Receiver<()>,
 ) -> std::io::Result<JoinHandle<()>> {
     thread::Builder::new()
@@ -28,6 +30,13 @@ pub fn start(
                     recv(requests) -> request => match request {
                         Ok(request) => serve(&mut handler, &request),
                         Err(_) => return,
+                    },
+                    recv(local) -> request => match request {
+                        Ok(LocalRequest { topic, payload, reply }) => {
+                            // Who has stopped waiting does not need the answer.
+                            reply.send(handler.answer(topic, Some(&payload))).ok();
+                        }
+                        Err(_) => local = crossbeam_channel::never(),
                     },
                     default(TICK) => {}
                 }

@@ -10,6 +10,7 @@
 mod answer_cache;
 mod command_handler;
 pub mod command_server;
+mod local_commands;
 pub mod parameter_sets;
 pub mod parameter_store;
 pub mod persisted_state;
@@ -19,5 +20,6 @@ mod state_file;
 
 pub use answer_cache::{CachedAnswer, PayloadHash};
 pub use command_handler::{CommandHandler, CommandHandlerConfig, SEARCH_PATIENCE};
+pub use local_commands::{LocalCommands, LocalRequest};
 pub use request::Request;
 pub use state_file::{StateFile, StateFileError};

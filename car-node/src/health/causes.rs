@@ -18,6 +18,8 @@ pub(super) struct CauseSources<'a> {
     pub(super) odometry_jump: Option<f64>,
     /// A recent jump of a pose that was trusted \[m\].
     pub(super) pose_jump: Option<f64>,
+    /// A recent step of the sensors' clock \[s\].
+    pub(super) clock_step: Option<f64>,
     /// The localizer has given its pose up.
     pub(super) gave_up: bool,
     /// For how long scans have repeated \[s\]; None while they do not.
@@ -64,6 +66,10 @@ impl CauseSources<'_> {
         let pose_jump = self
             .pose_jump
             .map(|distance| measured(CauseKind::Innovation, Severity::Critical, distance, limits.leap));
+        let clock_step = self.clock_step.map(|by| Cause {
+            value: Some(finite(by)),
+            ..plain(CauseKind::ClockStep, Severity::Info)
+        });
         let findings = self
             .findings
             .iter()
@@ -88,6 +94,7 @@ impl CauseSources<'_> {
             .chain(pose_jump)
             .chain(findings)
             .chain(repeating)
+            .chain(clock_step)
             .chain(sensors)
             .collect();
         causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));

@@ -63,6 +63,8 @@ pub struct Monitor {
     odometry_jump: Option<(Stamp, f64)>,
     /// The last jump of a pose that was trusted: when, and how far \[m\].
     pose_jump: Option<(Stamp, f64)>,
+    /// When the sensors' clock was set last, and by how much \[s\].
+    clock_step: Option<(Stamp, f64)>,
     /// The state is LOST because the localizer gave its pose up, by a jump or a search, and for nothing else.
     given_up: bool,
     /// The state before STALE.
@@ -97,6 +99,7 @@ impl Monitor {
             ages: PoseAges::default(),
             odometry_jump: None,
             pose_jump: None,
+            clock_step: None,
             given_up: false,
             before_stale: State::Init,
         }
@@ -130,6 +133,30 @@ impl Monitor {
         self.silence.on_scan(now);
         let [first, _] = self.refused.unwrap_or([now; 2]);
         self.refused = Some([first, now]);
+    }
+
+    /// The clock that every `now` is read from was moved forwards by this \[s\]. What is kept of it moves along.
+    pub fn on_clock_moved(&mut self, by: f64) {
+        self.silence.on_clock_moved(by);
+        let kept = [
+            Some(&mut self.verdict.since),
+            self.repeating_since.as_mut(),
+            self.odometry_jump.as_mut().map(|(at, _)| at),
+            self.pose_jump.as_mut().map(|(at, _)| at),
+            self.clock_step.as_mut().map(|(at, _)| at),
+        ];
+        for at in kept
+            .into_iter()
+            .flatten()
+            .chain(self.refused.iter_mut().flatten())
+        {
+            *at = at.plus(by);
+        }
+    }
+
+    /// The sensors' clock was set by this, back if negative \[s\]; stamps go on as before.
+    pub fn on_clock_step(&mut self, now: Stamp, by: f64) {
+        self.clock_step = Some((now, by));
     }
 
     /// The localizer was given a new pose.
@@ -358,6 +385,7 @@ impl Monitor {
                 .is_some_and(|[first, last]| last.since(first) >= self.thresholds.bad_for),
             odometry_jump: recent(self.odometry_jump),
             pose_jump: recent(self.pose_jump),
+            clock_step: recent(self.clock_step),
             gave_up: self.gave_up,
             repeating: self.repeating_since.map(|since| now.since(since)),
             sensors: self.sensors,

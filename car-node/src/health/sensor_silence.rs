@@ -22,6 +22,16 @@ impl SensorSilence {
         self.last_odometry = Some(now);
     }
 
+    /// The clock that `now` is read from was moved \[s\].
+    pub(super) fn on_clock_moved(&mut self, by: f64) {
+        for last in [&mut self.last_scan, &mut self.last_odometry]
+            .into_iter()
+            .flatten()
+        {
+            *last = last.plus(by);
+        }
+    }
+
     /// The sensors that have been silent for longer than `limit` \[s\], each with how long \[s\]. A sensor that has never sent
     /// counts as silent since `start`.
     pub(super) fn silent(&self, now: Stamp, start: Stamp, limit: f64) -> Vec<(CauseKind, f64)> {

@@ -5,19 +5,21 @@ use std::sync::{Arc, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, Sender, select};
+use crossbeam_channel::{Receiver, select};
 use maps::{Pose, Raceline};
-use protocol::{Cause, CauseKind, EventKind, Rates, SetRef};
-use synpf::{Dropped, Hypothesis, Localizer, Mode, Odometry, Scan, Stamp, TrackMap, Update};
+use protocol::{Cause, CauseKind, EventKind, Rates, SetRef, Severity};
+use synpf::{Dropped, Hypothesis, Localizer, Odometry, Scan, Stamp, TrackMap, Update};
 
 use super::filter_command::{FilterCommand, LocalizerChange};
 use super::job_worker::JobWorker;
 use super::lap_counter::LapCounter;
 use super::pace::Pace;
+use super::ros_feed::RosFeed;
 use super::shadow_channel::{ShadowInput, ShadowScan, ShadowSender};
 use super::table_worker::TableWorker;
 use super::views;
 use crate::health::{Monitor, Proposal, SetRecommender, SlipEvent, SlipTracker, State};
+use crate::ros2::output::RosSink;
 use crate::sensors::bag::SensorEvent;
 use crate::sensors::clock::SensorClock;
 use crate::sensors::{Feed, PoseEstimate};
@@ -48,8 +50,8 @@ pub struct FilterConfig {
     pub shared: Arc<SharedState>,
     /// Receives a copy of the sensor data while a shadow set runs.
     pub shadow: ShadowSender,
-    /// Receives every pose estimate while the car is localized, such as for the car's controller.
-    pub pose_sink: Option<Sender<PoseEstimate>>,
+    /// Receives poses, health and messages for the car's own nodes.
+    pub ros: Option<RosSink>,
 }
 
 /// One pace for each topic with a rate of its own.
@@ -83,6 +85,7 @@ struct FilterWorker {
     announced: Vec<CauseKind>,
     tables: TableWorker,
     jobs: JobWorker,
+    ros: RosFeed,
 }
 
 /// Health is checked at least this often, sensor data or not.
@@ -98,6 +101,7 @@ pub fn start(
     let jobs = JobWorker::start()?;
     thread::Builder::new().name("filter".into()).spawn(move || {
         let last_state = config.monitor.verdict().state;
+        let ros = RosFeed::new(config.ros.clone());
         FilterWorker {
             config,
             paces: Paces::default(),
@@ -111,6 +115,7 @@ pub fn start(
             announced: Vec::new(),
             tables,
             jobs,
+            ros,
         }
         .run(feed, &commands);
     })
@@ -266,10 +271,25 @@ impl FilterWorker {
                 }
                 return;
             }
-            Feed::Log(text) => return self.event(EventKind::Warning { text }),
+            Feed::Log(text) => {
+                self.ros.log(self.now(), Severity::Warning, &text);
+                return self.event(EventKind::Warning { text });
+            }
             Feed::InitialPose { pose, by } => return self.initialize_from_source(pose, &by),
+            Feed::Clock { moved, step, text } => return self.on_clock(moved, step, text),
+            Feed::Mount { mount, text } => {
+                let laser = mount.base_link_from_laser;
+                self.config.base_link_from_laser = laser;
+                self.config.shared.set_laser(laser);
+                self.config.localizer.set_laser(laser);
+                self.forward(|| ShadowInput::Laser(laser));
+                self.ros.log(self.now(), Severity::Info, &text);
+                return self.event(EventKind::Warning { text });
+            }
             Feed::GlobalSearch { by } => {
                 self.relocalize();
+                let text = format!("{by}: the whole map is searched");
+                self.ros.log(self.now(), Severity::Info, text);
                 return self.event_by(EventKind::SearchStarted, &by);
             }
         };
@@ -294,16 +314,36 @@ impl FilterWorker {
         }
     }
 
+    /// The sensors' clock was set, or its reading was moved.
+    fn on_clock(&mut self, moved: f64, step: Option<f64>, text: Option<String>) {
+        let now = self.now();
+        self.config.monitor.on_clock_moved(moved);
+        if let Some(step) = step {
+            self.config.monitor.on_clock_step(now, step);
+        }
+        if let Some(text) = text {
+            self.ros.log(now, Severity::Warning, &text);
+            self.event(EventKind::Warning { text });
+        }
+    }
+
     fn initialize_from_source(&mut self, pose: Pose, by: &str) {
         let before = self.last_update.as_ref().map(|update| wire::pose2(update.pose));
         let kind = match self.initialize(pose) {
-            Ok(()) => EventKind::PoseInitialized {
-                before,
-                pose: wire::pose2(pose),
-            },
-            Err(fault) => EventKind::Warning {
-                text: format!("{by}: initial pose refused: {fault}"),
-            },
+            Ok(()) => {
+                let (x, y, heading) = (pose.x, pose.y, pose.heading.to_degrees());
+                let text = format!("{by}: initial pose taken: {x:.2}, {y:.2} m, {heading:.1} deg");
+                self.ros.log(self.now(), Severity::Info, text);
+                EventKind::PoseInitialized {
+                    before,
+                    pose: wire::pose2(pose),
+                }
+            }
+            Err(fault) => {
+                let text = format!("{by}: initial pose refused: {fault}");
+                self.ros.log(self.now(), Severity::Warning, &text);
+                EventKind::Warning { text }
+            }
         };
         self.event_by(kind, by);
     }
@@ -325,7 +365,8 @@ impl FilterWorker {
                 pose,
                 twist: odometry.twist,
             };
-            self.share(estimate, update.mode);
+            self.ros.on_odometry(&odometry, pose, update);
+            self.share(estimate);
             if self.config.predict && self.paces.pose.due(odometry.stamp, self.rates().pose) {
                 let report = self.pose_report(estimate, update, true);
                 self.config.shared.telemetry.pose(report);
@@ -366,7 +407,8 @@ impl FilterWorker {
             pose: update.pose,
             twist: update.twist,
         };
-        self.share(estimate, update.mode);
+        self.ros.on_update(&update, self.config.localizer.as_ref());
+        self.share(estimate);
         self.count_laps(&update);
         let report = self.pose_report(estimate, &update, false);
         let records = self.records();
@@ -407,14 +449,8 @@ impl FilterWorker {
         Ok(())
     }
 
-    /// Gives the estimate to the car's controller and to a simulated driver.
-    fn share(&self, estimate: PoseEstimate, mode: Mode) {
-        // A sink that is full misses this estimate and gets the next one.
-        if mode == Mode::Tracking
-            && let Some(sink) = &self.config.pose_sink
-        {
-            sink.try_send(estimate).ok();
-        }
+    /// Gives the estimate to a simulated driver.
+    fn share(&self, estimate: PoseEstimate) {
         let mut latest = self
             .config
             .shared
@@ -507,11 +543,14 @@ impl FilterWorker {
     /// Publishes health: every update to the recorder, and at its rate or on a change to the pit wall.
     fn publish_health(&mut self, now: Stamp, updated: bool) {
         let rates = self.rates();
-        let state = self.config.monitor.verdict().state;
+        let verdict = self.config.monitor.verdict();
+        let state = verdict.state;
         let changed = state != self.last_state;
         let live = self.paces.health.due(now, rates.health) || changed;
         let recorded = updated && self.records();
-        if !live && !recorded {
+        let kinds = verdict.causes.iter().map(|cause| cause.kind);
+        let for_ros = self.ros.wants_health(now, state, kinds);
+        if !live && !recorded && !for_ros {
             return;
         }
         let verdict = self.config.monitor.verdict().clone();
@@ -536,10 +575,15 @@ impl FilterWorker {
             proposal: advice.proposal,
             auto: advice.auto,
         };
-        self.config.shared.telemetry.record(Record::Health {
-            report,
-            live,
-            recorded,
-        });
+        if for_ros {
+            self.ros.health(report.clone());
+        }
+        if live || recorded {
+            self.config.shared.telemetry.record(Record::Health {
+                report,
+                live,
+                recorded,
+            });
+        }
     }
 }

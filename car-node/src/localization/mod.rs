@@ -6,6 +6,7 @@ mod job_worker;
 pub mod lap_counter;
 mod localizer_parameters;
 mod pace;
+mod ros_feed;
 pub mod shadow;
 pub mod shadow_channel;
 mod start;

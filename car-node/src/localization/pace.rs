@@ -15,6 +15,8 @@ impl Pace {
             return false;
         }
         let period = 1.0 / f64::from(rate);
+        // The clock was set back: what was next is far off.
+        self.next = self.next.filter(|next| next.since(now) < 2.0 * period);
         // A little early counts as due, so that every fourth of 40 jittering scans a second makes 10 Hz.
         if self.next.is_some_and(|next| now.since(next) < -0.2 * period) {
             return false;
@@ -44,5 +46,9 @@ mod tests {
         assert!(!pace.due(Stamp(0).plus(100.0), 0.0), "a rate of 0 is never due");
         assert!(pace.due(Stamp(0).plus(100.0), 10.0), "due again after a pause");
         assert!(!pace.due(Stamp(0).plus(100.01), 10.0), "without catching up");
+        assert!(
+            pace.due(Stamp(0).plus(50.0), 10.0),
+            "due when the clock was set back"
+        );
     }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
+use maps::Pose;
 use protocol::SetRef;
 use synpf::{Odometry, Scan, Update, YawRate};
 
@@ -18,6 +19,8 @@ pub enum ShadowInput {
     Scan(Box<ShadowScan>),
     /// The filter was given a new pose; the shadow starts again from it.
     PoseReset,
+    /// The laser is mounted elsewhere than was assumed: its pose on `base_link`.
+    Laser(Pose),
 }
 
 /// A scan, with the update that it led to under the set in force.

@@ -28,7 +28,9 @@ use crate::control::parameter_sets::{self, NamedSet, SetError};
 use crate::control::parameter_store::ParameterStore;
 use crate::control::persisted_state::PersistedState;
 use crate::control::query_server::QueryServer;
-use crate::control::{CommandHandlerConfig, SEARCH_PATIENCE, StateFile, StateFileError, command_server};
+use crate::control::{
+    CommandHandlerConfig, LocalCommands, SEARCH_PATIENCE, StateFile, StateFileError, command_server,
+};
 use crate::health::{Monitor, Thresholds};
 use crate::localization::Start;
 use crate::localization::filter_worker::{self, FilterConfig};
@@ -36,8 +38,9 @@ use crate::localization::shadow;
 use crate::localization::shadow_channel::shadow_channel;
 use crate::network::{self, NetworkError};
 use crate::recording::{FileHead, FileServer, RecordError, RecordOptions, RecorderThread};
+use crate::ros2::output::RosSink;
 use crate::sensors::clock::{SensorClock, wall_now};
-use crate::sensors::{self, PoseEstimate, Source};
+use crate::sensors::{self, Source};
 use crate::telemetry::load;
 use crate::telemetry::publisher::Publisher;
 use crate::telemetry::replay_buffer::ReplayBuffer;
@@ -82,8 +85,8 @@ pub struct NodeConfig {
     pub thresholds: Thresholds,
     /// Folder for what survives a restart; without one, nothing does.
     pub state: Option<PathBuf>,
-    /// Receives every pose estimate while the car is localized, such as for the car's controller.
-    pub pose_sink: Option<Sender<PoseEstimate>>,
+    /// Receives poses, health and messages for the car's own nodes.
+    pub ros: Option<RosSink>,
     /// Where to record on the car's own disk; without it, the car does not record.
     pub record: Option<RecordOptions>,
 }
@@ -104,7 +107,7 @@ impl NodeConfig {
             predict: false,
             thresholds: Thresholds::default(),
             state: None,
-            pose_sink: None,
+            ros: None,
             record: None,
         }
     }
@@ -160,6 +163,7 @@ pub struct Node {
     query_server: JoinHandle<()>,
     file_server: JoinHandle<()>,
     load: JoinHandle<()>,
+    local_commands: LocalCommands,
     shadow: JoinHandle<()>,
     publisher: JoinHandle<()>,
     recorder: Option<RecorderThread>,
@@ -196,7 +200,7 @@ impl Node {
             predict,
             thresholds,
             state,
-            pose_sink,
+            ros,
             record,
         } = config;
         if !(rate.is_finite() && rate > 0.0) {
@@ -249,7 +253,7 @@ impl Node {
             ..SharedState::default()
         });
         let recorder = launch.map(|launch| {
-            let shared = Arc::clone(&shared);
+            let (shared, clock) = (Arc::clone(&shared), clock.clone());
             launch.run(move |kind| shared.event(clock.now(), 0, kind, None, None))
         });
         let recorder = recorder.transpose()?;
@@ -259,7 +263,7 @@ impl Node {
             &session,
             &car,
             run_id,
-            clock,
+            clock.clone(),
             Arc::clone(&shared),
             Arc::clone(&replay_buffer),
         )?;
@@ -267,6 +271,7 @@ impl Node {
         let (stop_source, source_stops) = bounded(0);
         let (stop_control, control_stops) = bounded(0);
         let (feed, filter_feed) = bounded(sensors::QUEUE);
+        let (local_commands, local_requests) = LocalCommands::new(run_id);
         let (to_filter, filter_commands) = bounded(QUEUE);
         let (to_command_server, command_requests) = bounded(QUEUE);
         let (to_query_server, query_requests) = bounded(QUEUE);
@@ -298,17 +303,22 @@ impl Node {
                 monitor,
                 base_link_from_laser: mount.base_link_from_laser,
                 raceline: map.raceline,
-                clock,
+                clock: clock.clone(),
                 set: store.reference(),
                 predict,
                 shared: Arc::clone(&shared),
                 shadow: shadow_sender,
-                pose_sink,
+                ros,
             },
             filter_feed,
             filter_commands,
         )?;
-        let shadow = shadow::start(shadow_receiver, shadow_commands, Arc::clone(&shared), clock)?;
+        let shadow = shadow::start(
+            shadow_receiver,
+            shadow_commands,
+            Arc::clone(&shared),
+            clock.clone(),
+        )?;
         let command_server = command_server::start(
             CommandHandlerConfig {
                 store,
@@ -317,12 +327,13 @@ impl Node {
                 shadow_commands: to_shadow,
                 base_link_from_laser: mount.base_link_from_laser,
                 shared: Arc::clone(&shared),
-                clock,
+                clock: clock.clone(),
                 run_id,
                 track_map: map.map,
                 search_patience: SEARCH_PATIENCE,
             },
             command_requests,
+            local_requests,
             control_stops.clone(),
         )?;
         let query_server = QueryServer {
@@ -349,14 +360,14 @@ impl Node {
             &to_file_server,
             &shared,
         )?;
-        let link_reports = queryables::subscribe_to_link_reports(&session, &car, &shared, clock)?;
-        let namesakes = namesake::watch(&session, &car, run_id, &shared, clock)?;
+        let link_reports = queryables::subscribe_to_link_reports(&session, &car, &shared, clock.clone())?;
+        let namesakes = namesake::watch(&session, &car, run_id, &shared, clock.clone())?;
         let alive = network::declare_alive(&session, &car, run_id)?;
         // The sensors start last: the pit wall can then see the first scan.
         let counters = Arc::clone(&shared.counters);
         let source = sensors::play(
             source,
-            clock,
+            clock.clone(),
             feed,
             Arc::clone(&shared.pose),
             move || counters.overrun(),
@@ -375,6 +386,7 @@ impl Node {
             query_server,
             file_server,
             load,
+            local_commands,
             shadow,
             publisher,
             recorder,
@@ -393,6 +405,11 @@ impl Node {
     /// The state that the threads share: counters, rates, the latest pose.
     pub fn shared(&self) -> &Arc<SharedState> {
         &self.shared
+    }
+
+    /// Gives commands from inside the node, such as from a ROS service.
+    pub fn local_commands(&self) -> &LocalCommands {
+        &self.local_commands
     }
 
     /// Ends the car: the sensors first, the network last, so that the last events are still sent. Takes a few seconds at most,

@@ -49,6 +49,7 @@ pub(super) fn watch(
                 return;
             }
             let (name, shared, others) = (name.clone(), Arc::clone(&shared), Arc::clone(&others));
+            let clock = clock.clone();
             let watch = move || {
                 std::thread::sleep(PATIENCE);
                 if others.lock().unwrap_or_else(PoisonError::into_inner).is_empty() {

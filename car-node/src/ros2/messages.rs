@@ -269,9 +269,15 @@ pub struct Imu {
 impl Imu {
     /// The yaw rate, for a sensor mounted with z up.
     pub fn to_yaw_rate(&self) -> YawRate {
+        self.yaw_rate_turned(&UnitQuaternion::identity())
+    }
+
+    /// The yaw rate, for a sensor that is turned so on the car.
+    pub fn yaw_rate_turned(&self, base_link_from_imu: &UnitQuaternion<f64>) -> YawRate {
+        let Vector3 { x, y, z } = self.angular_velocity;
         YawRate {
             stamp: self.header.stamp.into(),
-            rate: self.angular_velocity.z,
+            rate: (base_link_from_imu * nalgebra::Vector3::new(x, y, z)).z,
         }
     }
 }
@@ -321,6 +327,86 @@ pub struct TransformStamped {
 pub struct TfMessage {
     /// Any number of transforms.
     pub transforms: Vec<TransformStamped>,
+}
+
+/// `geometry_msgs/PoseArray`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PoseArray {
+    /// Time and frame.
+    pub header: Header,
+    /// Any number of poses.
+    pub poses: Vec<RosPose>,
+}
+
+/// `nav_msgs/OccupancyGrid`, with its `MapMetaData` in line.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct RosGrid {
+    /// Time and frame.
+    pub header: Header,
+    /// When the map was loaded.
+    pub load_time: Time,
+    /// Edge of a cell \[m\].
+    pub resolution: f32,
+    /// Cells along x.
+    pub width: u32,
+    /// Cells along y.
+    pub height: u32,
+    /// Pose of the corner of the first cell.
+    pub origin: RosPose,
+    /// Row by row from the origin: -1 unknown, 0 free, 100 occupied.
+    pub data: Vec<i8>,
+}
+
+/// `diagnostic_msgs/KeyValue`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct KeyValue {
+    /// The name.
+    pub key: String,
+    /// The value.
+    pub value: String,
+}
+
+/// `diagnostic_msgs/DiagnosticStatus`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct DiagnosticStatus {
+    /// 0 OK, 1 WARN, 2 ERROR, 3 STALE.
+    pub level: u8,
+    /// What is judged.
+    pub name: String,
+    /// The judgement.
+    pub message: String,
+    /// The machine.
+    pub hardware_id: String,
+    /// Values behind it.
+    pub values: Vec<KeyValue>,
+}
+
+/// `diagnostic_msgs/DiagnosticArray`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct DiagnosticArray {
+    /// Time.
+    pub header: Header,
+    /// Any number of judgements.
+    pub status: Vec<DiagnosticStatus>,
+}
+
+/// `rcl_interfaces/Log`, the messages of `/rosout`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Log {
+    /// Time.
+    pub stamp: Time,
+    /// 20 INFO, 30 WARN, 40 ERROR.
+    pub level: u8,
+    /// The node.
+    pub name: String,
+    /// The text.
+    pub msg: String,
+    /// Source file.
+    pub file: String,
+    /// Function.
+    pub function: String,
+    /// Line.
+    pub line: u32,
 }
 
 #[cfg(test)]
@@ -396,5 +482,94 @@ mod tests {
             decode::<Time>(&[0, 3, 0, 0, 0, 0, 0, 0]),
             Err(CdrError::Encapsulation(0, 3))
         ));
+    }
+
+    /// Padding of each type by hand: a string before a number, a byte before a string, bytes before nothing.
+    #[test]
+    fn what_is_published_is_laid_out_as_ros_does() {
+        let mut expected = vec![0, 1, 0, 0];
+        expected.extend(7_i32.to_le_bytes());
+        expected.extend(5_u32.to_le_bytes());
+        expected.extend([4, 0, 0, 0]);
+        expected.extend(b"map\0");
+        expected.extend(7_i32.to_le_bytes());
+        expected.extend(0_u32.to_le_bytes());
+        expected.extend(0.05_f32.to_le_bytes());
+        expected.extend(3_u32.to_le_bytes());
+        expected.extend(1_u32.to_le_bytes());
+        expected.extend([0; 4]); // doubles are aligned to 8
+        for value in [1.0_f64, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0] {
+            expected.extend(value.to_le_bytes());
+        }
+        expected.extend([3, 0, 0, 0, 255, 0, 100]);
+        let header = Header {
+            stamp: Time { sec: 7, nanosec: 5 },
+            frame_id: "map".into(),
+        };
+        let grid = RosGrid {
+            header: header.clone(),
+            load_time: Time { sec: 7, nanosec: 0 },
+            resolution: 0.05,
+            width: 3,
+            height: 1,
+            origin: Pose::new(1.0, 2.0, 0.0).into(),
+            data: vec![-1, 0, 100],
+        };
+        assert_eq!(encode(&grid).expect("encodes"), expected);
+        assert_eq!(decode::<RosGrid>(&expected).expect("decodes"), grid);
+
+        let mut expected = expected[..16].to_vec();
+        expected.extend(b"map\0");
+        expected.extend([1, 0, 0, 0, 2, 0, 0, 0]); // one status, its level, padding
+        for text in ["a", "lost", ""] {
+            expected.extend((text.len() as u32 + 1).to_le_bytes());
+            expected.extend(text.as_bytes());
+            expected.push(0);
+            while expected.len() % 4 != 0 {
+                expected.push(0);
+            }
+        }
+        expected.extend([1, 0, 0, 0, 2, 0, 0, 0]);
+        expected.extend(b"k\0\0\0");
+        expected.extend([2, 0, 0, 0]);
+        expected.extend(b"v\0");
+        let status = DiagnosticStatus {
+            level: 2,
+            name: "a".into(),
+            message: "lost".into(),
+            values: vec![KeyValue {
+                key: "k".into(),
+                value: "v".into(),
+            }],
+            ..DiagnosticStatus::default()
+        };
+        let diagnostics = DiagnosticArray {
+            header,
+            status: vec![status],
+        };
+        assert_eq!(encode(&diagnostics).expect("encodes"), expected);
+        assert_eq!(
+            decode::<DiagnosticArray>(&expected).expect("decodes"),
+            diagnostics
+        );
+    }
+
+    #[test]
+    fn lists_of_poses_and_log_messages_survive_a_round_trip() {
+        let particles = PoseArray {
+            poses: vec![Pose::new(1.0, 2.0, 0.5).into(), Pose::new(-3.0, 0.0, -2.0).into()],
+            ..PoseArray::default()
+        };
+        let bytes = encode(&particles).expect("encodes");
+        assert_eq!(decode::<PoseArray>(&bytes).expect("decodes"), particles);
+        let log = Log {
+            level: 30,
+            name: "synpf".into(),
+            msg: "initial pose refused".into(),
+            line: 9,
+            ..Log::default()
+        };
+        let bytes = encode(&log).expect("encodes");
+        assert_eq!(decode::<Log>(&bytes).expect("decodes"), log);
     }
 }

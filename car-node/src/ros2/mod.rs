@@ -1,5 +1,10 @@
-//! ROS 2: its messages, and a publisher for the car's own nodes.
+//! ROS 2: its messages, this node in its graph, and what the node publishes to the car's own nodes.
 
+pub mod graph;
 pub mod messages;
-pub mod pose_publisher;
+pub mod output;
+pub mod output_publisher;
+pub mod parameter_messages;
+pub mod services;
 pub mod topics;
+pub mod types;

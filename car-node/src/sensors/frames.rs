@@ -3,7 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use maps::Pose;
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use crate::ros2::messages::TransformStamped;
 
@@ -39,8 +39,11 @@ pub(crate) fn is_base(frame: &str) -> bool {
     matches!(frame.rsplit('/').next(), Some(BASE_LINK | "base_footprint"))
 }
 
-/// The frames of `/tf_static`, as a forest.
-#[derive(Debug, Default)]
+/// Frames beyond this many are not taken.
+const MOST_FRAMES: usize = 1000;
+
+/// The frames of `/tf_static` and `/tf`, as a forest.
+#[derive(Debug, Clone, Default)]
 pub struct Frames {
     /// Child to parent, with `parent_from_child`.
     parents: HashMap<String, (String, Isometry3<f64>)>,
@@ -57,11 +60,15 @@ fn bare(frame: &str) -> &str {
 }
 
 impl Frames {
-    /// Adds a transform; the latest one of a child counts. Returns false for one that is not valid.
+    /// Adds a transform; the latest one of a child counts. Returns false for one that is not valid, or one too many.
     pub fn insert(&mut self, transform: &TransformStamped) -> bool {
         let Some(parent_from_child) = transform.transform.spatial() else {
             return false;
         };
+        let child = bare(&transform.child_frame_id);
+        if self.parents.len() >= MOST_FRAMES && !self.parents.contains_key(child) {
+            return false;
+        }
         self.parents.insert(
             bare(&transform.child_frame_id).to_owned(),
             (bare(&transform.header.frame_id).to_owned(), parent_from_child),
@@ -110,6 +117,15 @@ impl Frames {
         self.parents.is_empty()
     }
 
+    /// Adds all of another forest's frames.
+    pub fn extend(&mut self, other: &Self) {
+        for (child, parent) in &other.parents {
+            if self.parents.len() < MOST_FRAMES || self.parents.contains_key(child) {
+                self.parents.insert(child.clone(), parent.clone());
+            }
+        }
+    }
+
     /// The root of `frame`'s tree, with `root_from_frame`. A loop ends after one round.
     fn root(&self, frame: &str) -> (String, Isometry3<f64>) {
         let (mut at, mut root_from_frame) = (frame.to_owned(), Isometry3::identity());
@@ -123,14 +139,21 @@ impl Frames {
         (at, root_from_frame)
     }
 
-    /// How `laser` is mounted on `base`, through any number of frames. None when they are not connected.
-    pub fn mount(&self, base: &str, laser: &str) -> Option<Mount> {
+    /// `base_from_frame`, through any number of frames. None when they are not connected.
+    fn transform(&self, base: &str, frame: &str) -> Option<Isometry3<f64>> {
         let (base_root, root_from_base) = self.root(bare(base));
-        let (laser_root, root_from_laser) = self.root(bare(laser));
-        if base_root != laser_root {
-            return None;
-        }
-        let base_from_laser = root_from_base.inverse() * root_from_laser;
+        let (frame_root, root_from_frame) = self.root(bare(frame));
+        (base_root == frame_root).then(|| root_from_base.inverse() * root_from_frame)
+    }
+
+    /// How a sensor in `frame` is turned on `base`. None when they are not connected.
+    pub fn rotation(&self, base: &str, frame: &str) -> Option<UnitQuaternion<f64>> {
+        self.transform(base, frame).map(|transform| transform.rotation)
+    }
+
+    /// How `laser` is mounted on `base`. None when they are not connected.
+    pub fn mount(&self, base: &str, laser: &str) -> Option<Mount> {
+        let base_from_laser = self.transform(base, laser)?;
         let forward = base_from_laser.rotation * Vector3::x();
         let up = base_from_laser.rotation * Vector3::z();
         Some(Mount {
@@ -194,6 +217,23 @@ mod tests {
         let mount = frames.mount("base_link", "laser").expect("connected");
         assert!(mount.upside_down);
         assert!(mount.base_link_from_laser.heading.abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_sensor_on_its_side_is_turned() {
+        let mut frames = Frames::default();
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let pitched = Orientation {
+            x: 0.0,
+            y: half,
+            z: 0.0,
+            w: half,
+        };
+        frames.insert(&transform("base_link", "imu", 0.1, pitched));
+        let rotation = frames.rotation("base_link", "/imu").expect("connected");
+        // Its x axis points down: a turn about it, to the right.
+        assert!((rotation * Vector3::x()).z < -0.999);
+        assert!(frames.rotation("base_link", "camera").is_none());
     }
 
     #[test]

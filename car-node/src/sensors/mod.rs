@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TrySendError};
+use crossbeam_channel::{Receiver, RecvTimeoutError, SendTimeoutError, Sender};
 use maps::Pose;
 use synpf::{Stamp, Twist};
 
@@ -38,6 +38,22 @@ pub enum Feed {
         pose: Pose,
         /// Where it comes from: a ROS topic, or the recovery crew of a simulated race.
         by: String,
+    },
+    /// The sensors' clock was set, or runs otherwise than it did. Stamps of sensor data go on as before.
+    Clock {
+        /// By how much [`SensorClock`] was moved \[s\].
+        moved: f64,
+        /// By how much the sensors' clock was set, back if negative \[s\].
+        step: Option<f64>,
+        /// The same for people, if it is worth a message.
+        text: Option<String>,
+    },
+    /// How the laser is mounted, found out late. It holds for the scans after it.
+    Mount {
+        /// The mount.
+        mount: Mount,
+        /// The same for people.
+        text: String,
     },
     /// A request to search the whole map.
     GlobalSearch {
@@ -99,10 +115,13 @@ pub type SharedPose = Arc<Mutex<Option<PoseEstimate>>>;
 /// Messages that wait for the filter: a quarter of a second of all sensors.
 pub const QUEUE: usize = 64;
 
+/// How long a message waits for room in the queue.
+pub const WAITS: Duration = Duration::from_millis(100);
+
 /// Starts the thread that plays `source` into `filter` by `clock`.
 ///
-/// It ends with the source, when the filter is gone, or when `stop` is dropped. A message that finds the queue full is
-/// dropped, and `on_overrun` is called: a late filter needs new data more than old data.
+/// It ends with the source, when the filter is gone, or when `stop` is dropped. A message that finds the queue full waits for
+/// [`WAITS`] at most. Then it is dropped, and `on_overrun` is called: a late filter needs new data more than old data.
 pub fn play(
     mut source: Box<dyn Source>,
     clock: SensorClock,
@@ -123,10 +142,10 @@ pub fn play(
                 return;
             }
             let Some(feed) = feed else { continue };
-            match filter.try_send(feed) {
+            match filter.send_timeout(feed, WAITS) {
                 Ok(()) => {}
-                Err(TrySendError::Full(_)) => on_overrun(),
-                Err(TrySendError::Disconnected(_)) => return,
+                Err(SendTimeoutError::Timeout(_)) => on_overrun(),
+                Err(SendTimeoutError::Disconnected(_)) => return,
             }
         }
     })

@@ -142,10 +142,10 @@ impl Source for SimulatedCar {
     }
 
     fn clock(&mut self, rate: f64) -> SensorClock {
-        *self
-            .race
+        self.race
             .clock
             .get_or_init(|| SensorClock::starting_at(self.race.epoch, rate))
+            .clone()
     }
 
     fn start(&self) -> Option<Pose> {

@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use maps::Pose;
 use protocol::{CommandId, EventKind, Rates};
 use synpf::Stamp;
 
@@ -27,6 +28,8 @@ pub struct SharedState {
     pub pose: SharedPose,
     /// Lowers the rates while the link is slow.
     pub throttle: Mutex<Throttle>,
+    /// Pose of the laser on `base_link`, once it was found out later than at the start.
+    pub laser: Mutex<Option<Pose>>,
     /// Name of the shadow set. The command handler starts it; the shadow's thread may drop it.
     pub shadow: Mutex<Option<String>>,
     /// Records on the car; None on a car without a folder for it.
@@ -42,6 +45,7 @@ impl Default for SharedState {
             advice: Mutex::default(),
             pose: SharedPose::default(),
             throttle: Mutex::default(),
+            laser: Mutex::default(),
             shadow: Mutex::default(),
             recorder: None,
         }
@@ -78,6 +82,16 @@ impl SharedState {
         self.recorder
             .as_ref()
             .is_some_and(|recorder| recorder.recording())
+    }
+
+    /// The laser's pose on `base_link`; None while it is as at the start.
+    pub fn laser(&self) -> Option<Pose> {
+        *self.laser.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Sets the laser's pose on `base_link`.
+    pub fn set_laser(&self, base_link_from_laser: Pose) {
+        *self.laser.lock().unwrap_or_else(PoisonError::into_inner) = Some(base_link_from_laser);
     }
 
     /// The latest pose estimate; None before the first.

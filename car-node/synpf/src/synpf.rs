@@ -563,6 +563,12 @@ impl Localizer for SynPf {
         Self::hypotheses(self)
     }
 
+    fn set_laser(&mut self, base_link_from_laser: Pose) {
+        if base_link_from_laser.is_finite() {
+            self.base_link_from_laser = base_link_from_laser;
+        }
+    }
+
     fn take_job(&mut self) -> Option<Job> {
         let check = self.take_global_check()?;
         Some(Box::new(move || Box::new(check.run())))

@@ -291,16 +291,21 @@ impl Car {
             monitor: Monitor::new(Thresholds::default(), clock.now()),
             base_link_from_laser: mount,
             raceline: None,
-            clock,
+            clock: clock.clone(),
             set: store.reference(),
             predict: true,
             shared: Arc::clone(&shared),
             shadow: shadow_sender,
-            pose_sink: None,
+            ros: None,
         };
         let filter = filter_worker::start(filter, filter_feed, filter_commands).expect("a thread");
-        let shadow =
-            shadow::start(shadow_receiver, shadow_commands, Arc::clone(&shared), clock).expect("a thread");
+        let shadow = shadow::start(
+            shadow_receiver,
+            shadow_commands,
+            Arc::clone(&shared),
+            clock.clone(),
+        )
+        .expect("a thread");
         let handler = CommandHandler::new(CommandHandlerConfig {
             store,
             file: None,

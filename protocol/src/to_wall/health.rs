@@ -162,6 +162,8 @@ pub enum CauseKind {
     ScanLag,
     /// Scans repeat under new stamps: the scanner or its driver hangs.
     RepeatedScans,
+    /// The sensors' clock was set, back if negative; its stamps are followed.
+    ClockStep,
 }
 
 impl CauseKind {
@@ -208,6 +210,7 @@ impl CauseKind {
             Self::AngleIncrementMissing => "angle_increment missing, taken from angle_min and angle_max",
             Self::ScanLag => "scan stamps late against odometry, corrected",
             Self::RepeatedScans => "scans repeat: scanner hangs, for",
+            Self::ClockStep => "sensors' clock was set, followed: by",
         }
     }
 
@@ -235,7 +238,8 @@ impl CauseKind {
             | Self::SweepFromScanTime
             | Self::TimeIncrementWrong
             | Self::ScanLag
-            | Self::RepeatedScans => "s",
+            | Self::RepeatedScans
+            | Self::ClockStep => "s",
             _ => "",
         }
     }

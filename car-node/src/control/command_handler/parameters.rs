@@ -1,5 +1,6 @@
 //! Commands about parameter sets: switching, trials, the shadow set, and the switches that the car makes by itself.
 
+use maps::Pose;
 use std::sync::PoisonError;
 use std::time::{Duration, Instant};
 
@@ -121,7 +122,7 @@ impl CommandHandler {
             LocalizerChange::Tune(prepared)
         } else {
             let localizer = set
-                .build(map, self.config.base_link_from_laser, SEED)
+                .build(map, self.laser(), SEED)
                 .map_err(|fault| vec![fault.to_string()])?;
             LocalizerChange::Replace(localizer)
         };
@@ -136,6 +137,14 @@ impl CommandHandler {
             .map_err(|fault| vec![fault])
     }
 
+    /// The laser's pose on `base_link`.
+    fn laser(&self) -> Pose {
+        self.config
+            .shared
+            .laser()
+            .unwrap_or(self.config.base_link_from_laser)
+    }
+
     /// Runs a shadow set, or ends it. The set's tables are built here, not in the shadow's thread.
     fn run_shadow(&mut self, command: &Command, set: Option<(String, Box<LocalizerParameters>)>) -> Outcome {
         let who = command.operator.clone();
@@ -148,7 +157,7 @@ impl CommandHandler {
         };
         let map = &self.config.track_map;
         parameters.prepare_tables(map, self.current_pose());
-        let localizer = match parameters.build(map, self.config.base_link_from_laser, SEED) {
+        let localizer = match parameters.build(map, self.laser(), SEED) {
             Ok(localizer) => localizer,
             Err(fault) => return refused(fault.to_string()),
         };

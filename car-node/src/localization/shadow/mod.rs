@@ -162,6 +162,10 @@ impl ShadowWorker {
                 running.initialized = None;
                 None
             }
+            ShadowInput::Laser(laser) => {
+                running.localizer.set_laser(laser);
+                None
+            }
             ShadowInput::Scan(scan) => {
                 let skipped = self.receiver.skipped();
                 let since = skipped - std::mem::replace(&mut running.skipped, skipped);

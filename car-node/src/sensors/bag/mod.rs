@@ -94,7 +94,7 @@ pub(crate) const ODOMETRY_NAMES: [&str; 4] = [
 ];
 pub(crate) const TRUTH_NAMES: [&str; 1] = ["/ground_truth/odom"];
 /// Where localizers publish their poses as `nav_msgs/Odometry`, ours among them.
-const LOCALIZER_OUTPUTS: [&str; 1] = [topics::POSE_ODOMETRY];
+const LOCALIZER_OUTPUTS: [&str; 4] = topics::POSES;
 pub(crate) const IMU_NAMES: [&str; 2] = ["/sensors/imu/raw", "/imu"];
 
 /// False for a topic of type `nav_msgs/Odometry` that is known to be no wheel odometry: ground truth, and the output of a

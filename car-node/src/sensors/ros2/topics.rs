@@ -1,4 +1,9 @@
-//! The topics that a car's sensors come on: types, usual names, and how zenoh keys name them.
+//! The topics that a car's sensors come on: types, usual names, how zenoh keys name them, and how their messages are read.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::Instant;
 
 use crossbeam_channel::Sender;
 use serde::de::DeserializeOwned;
@@ -8,6 +13,7 @@ use zenoh::sample::Sample;
 use crate::ros2::messages::{
     self, CdrError, Imu, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, TfMessage,
 };
+use crate::ros2::types::{self, RosType};
 use crate::sensors::bag::{IMU_NAMES, ODOMETRY_NAMES, SCAN_NAMES, Topics};
 
 /// The kinds of messages that the node subscribes to.
@@ -16,47 +22,54 @@ pub(super) enum Kind {
     Scan,
     Odometry,
     Imu,
-    StaticTransform,
+    Transforms,
     InitialPose,
     ClickedPoint,
 }
 
 impl Kind {
     /// The kinds from which the car's topics are discovered. The other two have one name each.
-    pub(super) const DISCOVERED: [Self; 4] = [Self::Scan, Self::Odometry, Self::Imu, Self::StaticTransform];
+    pub(super) const DISCOVERED: [Self; 4] = [Self::Scan, Self::Odometry, Self::Imu, Self::Transforms];
 
-    /// The type as the keys of `rmw_zenoh` spell it.
-    pub(super) fn dds_type(self) -> &'static str {
+    /// The message type.
+    pub(super) fn ros_type(self) -> RosType {
         match self {
-            Self::Scan => "sensor_msgs::msg::dds_::LaserScan_",
-            Self::Odometry => "nav_msgs::msg::dds_::Odometry_",
-            Self::Imu => "sensor_msgs::msg::dds_::Imu_",
-            Self::StaticTransform => "tf2_msgs::msg::dds_::TFMessage_",
-            Self::InitialPose => "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_",
-            Self::ClickedPoint => "geometry_msgs::msg::dds_::PointStamped_",
+            Self::Scan => types::LASER_SCAN,
+            Self::Odometry => types::ODOMETRY,
+            Self::Imu => types::IMU,
+            Self::Transforms => types::TF_MESSAGE,
+            Self::InitialPose => types::POSE_WITH_COVARIANCE_STAMPED,
+            Self::ClickedPoint => types::POINT_STAMPED,
         }
     }
 
-    /// The type as ROS spells it.
-    pub(super) fn ros_type(self) -> String {
-        self.dds_type()
-            .trim_end_matches('_')
-            .replace("::msg::dds_::", "/msg/")
+    /// The kind that is discovered by a type, as keys spell it.
+    pub(super) fn of_type(dds: &str) -> Option<Self> {
+        Self::DISCOVERED
+            .into_iter()
+            .find(|kind| kind.ros_type().dds == dds)
     }
 
-    /// The topic that was asked for, or else the usual names, the preferred one first.
-    pub(super) fn names(self, asked: &Topics) -> Vec<&str> {
-        let (asked, usual): (_, &[&str]) = match self {
-            Self::Scan => (&asked.scan, &SCAN_NAMES),
-            Self::Odometry => (&asked.odometry, &ODOMETRY_NAMES),
-            Self::Imu => (&asked.imu, &IMU_NAMES),
-            Self::StaticTransform => (&None, &["/tf_static"]),
-            Self::InitialPose => (&None, &["/initialpose"]),
-            Self::ClickedPoint => (&None, &["/clicked_point"]),
-        };
-        asked
-            .as_deref()
-            .map_or_else(|| usual.to_vec(), |asked| vec![asked])
+    /// The usual names in a car's namespace, the preferred one first.
+    pub(super) fn usual_names(self) -> &'static [&'static str] {
+        match self {
+            Self::Scan => &SCAN_NAMES,
+            Self::Odometry => &ODOMETRY_NAMES,
+            Self::Imu => &IMU_NAMES,
+            Self::Transforms => &["/tf_static", "/tf"],
+            Self::InitialPose => &["/initialpose"],
+            Self::ClickedPoint => &["/clicked_point"],
+        }
+    }
+
+    /// The topic that was asked for.
+    pub(super) fn asked(self, asked: &Topics) -> Option<&str> {
+        match self {
+            Self::Scan => asked.scan.as_deref(),
+            Self::Odometry => asked.odometry.as_deref(),
+            Self::Imu => asked.imu.as_deref(),
+            Self::Transforms | Self::InitialPose | Self::ClickedPoint => None,
+        }
     }
 
     pub(super) fn decode(self, payload: &[u8]) -> Result<Content, CdrError> {
@@ -67,7 +80,7 @@ impl Kind {
             Self::Scan => Content::Scan(of(payload)?),
             Self::Odometry => Content::Odometry(of(payload)?),
             Self::Imu => Content::Imu(of(payload)?),
-            Self::StaticTransform => Content::StaticTransform(of(payload)?),
+            Self::Transforms => Content::Transforms(of(payload)?),
             Self::InitialPose => Content::InitialPose(of(payload)?),
             Self::ClickedPoint => {
                 of::<PointStamped>(payload)?;
@@ -83,7 +96,7 @@ pub(super) enum Content {
     Scan(Box<LaserScan>),
     Odometry(Box<RosOdometry>),
     Imu(Box<Imu>),
-    StaticTransform(Box<TfMessage>),
+    Transforms(Box<TfMessage>),
     InitialPose(Box<PoseWithCovarianceStamped>),
     /// Where the point is does not matter.
     ClickedPoint,
@@ -96,21 +109,69 @@ pub(super) struct TopicMessage {
     pub(super) topic: String,
     /// The hash of the type, which the keys of `rmw_zenoh` contain.
     pub(super) hash: Option<String>,
+    /// When it came in.
+    pub(super) arrival: Instant,
     pub(super) content: Result<Content, CdrError>,
 }
 
-/// Decodes messages in zenoh's thread and queues them. A message that finds the queue full is dropped.
-pub(super) fn listener(kind: Kind, domain: u32, sender: &Sender<TopicMessage>) -> Callback<Sample> {
-    let sender = sender.clone();
+/// What the listeners in zenoh's threads share with the source.
+#[derive(Debug, Clone)]
+pub(super) struct Intake {
+    sender: Sender<TopicMessage>,
+    /// The topics to read; None while all are.
+    wanted: Arc<RwLock<Option<BTreeSet<String>>>>,
+    /// Messages that found the queue full.
+    dropped: Arc<AtomicU64>,
+}
+
+impl Intake {
+    pub(super) fn new(sender: Sender<TopicMessage>) -> Self {
+        Self {
+            sender,
+            wanted: Arc::default(),
+            dropped: Arc::default(),
+        }
+    }
+
+    /// Reads only these topics from now on.
+    pub(super) fn read_only(&self, topics: BTreeSet<String>) {
+        *self.wanted.write().unwrap_or_else(PoisonError::into_inner) = Some(topics);
+    }
+
+    fn wants(&self, topic: &str) -> bool {
+        let wanted = self.wanted.read().unwrap_or_else(PoisonError::into_inner);
+        wanted.as_ref().is_none_or(|topics| topics.contains(topic))
+    }
+
+    /// How many messages have found the queue full.
+    pub(super) fn dropped(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
+    }
+}
+
+/// Decodes messages in zenoh's thread and queues them. A message that finds the queue full is dropped and counted.
+pub(super) fn listener(kind: Kind, domain: u32, intake: &Intake) -> Callback<Sample> {
+    let intake = intake.clone();
     Callback::from(move |sample: Sample| {
-        let (topic, hash) = topic(sample.key_expr().as_str(), kind, domain);
-        // Moving transforms have the same type.
-        if kind == Kind::StaticTransform && !topic.ends_with("tf_static") {
+        let arrival = Instant::now();
+        let key = sample.key_expr().as_str();
+        // Telemetry for the pit wall may be on the same router, and has topics of such names.
+        if key.starts_with("synpf/") {
             return;
         }
-        let content = kind.decode(&sample.payload().to_bytes());
-        if sender.try_send(TopicMessage { topic, hash, content }).is_err() {
-            tracing::debug!("the queue is full: a message from ROS is dropped");
+        let (topic, hash) = topic(key, kind, domain);
+        let named = |name: &&str| topic.ends_with(*name);
+        if !intake.wants(&topic) || (kind == Kind::Transforms && !kind.usual_names().iter().any(named)) {
+            return;
+        }
+        let message = TopicMessage {
+            content: kind.decode(&sample.payload().to_bytes()),
+            topic,
+            hash,
+            arrival,
+        };
+        if intake.sender.try_send(message).is_err() {
+            intake.dropped.fetch_add(1, Ordering::Relaxed);
         }
     })
 }
@@ -119,18 +180,12 @@ pub(super) fn listener(kind: Kind, domain: u32, sender: &Sender<TopicMessage>) -
 pub(super) fn topic(key: &str, kind: Kind, domain: u32) -> (String, Option<String>) {
     let rmw = || {
         let (rest, hash) = key.strip_prefix(&format!("{domain}/"))?.rsplit_once('/')?;
-        Some((rest.strip_suffix(kind.dds_type())?.strip_suffix('/')?, hash))
+        Some((rest.strip_suffix(kind.ros_type().dds)?.strip_suffix('/')?, hash))
     };
     match rmw() {
         Some((name, hash)) => (format!("/{name}"), Some(hash.to_owned())),
         None => (format!("/{key}"), None),
     }
-}
-
-/// The topic `name` in the namespace of the scan: `/initialpose` for `/scan`, `/car2/initialpose` for `/car2/scan`.
-pub(super) fn in_namespace_of(scan: &str, name: &str) -> String {
-    let namespace = scan.rsplit_once('/').map_or("", |(namespace, _)| namespace);
-    format!("{namespace}{name}")
 }
 
 #[cfg(test)]
@@ -147,16 +202,6 @@ mod tests {
         assert_eq!(
             topic(humble, Kind::Odometry, 7),
             named("/odom", Some("TypeHashNotSupported"))
-        );
-    }
-
-    #[test]
-    fn a_topic_is_in_the_namespace_of_the_scan() {
-        assert_eq!(in_namespace_of("/scan", "/initialpose"), "/initialpose");
-        assert_eq!(in_namespace_of("/car2/scan", "/initialpose"), "/car2/initialpose");
-        assert_eq!(
-            in_namespace_of("/team/car2/scan", "/initialpose"),
-            "/team/car2/initialpose"
         );
     }
 }

@@ -539,6 +539,12 @@ impl Localizer for Reference {
             .collect()
     }
 
+    fn set_laser(&mut self, base_link_from_laser: Pose) {
+        if base_link_from_laser.is_finite() {
+            self.base_link_from_laser = base_link_from_laser;
+        }
+    }
+
     fn parameters(&self) -> ParameterValues {
         self.tuning.parameters.to_values()
     }

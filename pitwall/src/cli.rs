@@ -178,6 +178,17 @@ pub(crate) enum Verb {
         #[arg(short, long, value_name = "FILE")]
         output: PathBuf,
     },
+    /// List the recordings of a folder: date, track, cars, laps, best lap, sets, and what is missing.
+    Sessions {
+        /// Only those in which each of these words occurs: a date, a track, a car, a set, a marker.
+        words: Vec<String>,
+        /// The folder.
+        #[arg(long, value_name = "FOLDER", default_value = ".")]
+        folder: PathBuf,
+        /// Read every recording anew.
+        #[arg(long)]
+        rebuild: bool,
+    },
     /// Serve the page from a recording.
     Replay {
         /// The recording.

@@ -77,8 +77,9 @@ pub use network::{
 pub use program::program;
 pub use recording::{
     Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, Merged, MergedInput, Recorder,
-    RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered, StreamSummary,
-    Unreadable, UnreadableCount, fetch, merge, read_events, recover,
+    RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered, Session,
+    SessionIndex, SessionIndexError, StreamSummary, Unreadable, UnreadableCount, fetch, merge, read_events,
+    recover,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -56,7 +56,7 @@ pub use telemetry::Telemetry;
 pub use to_car::{
     Action, Answer, Candidate, Command, CommandId, FileInfo, FileName, FileNameError, FilesReply,
     FilesRequest, IdError, Kept, LinkReport, MissingReply, MissingRequest, Outcome, ParamsAction, Rates,
-    RatesAction, RecordAction, RelocalizeAction, Reply, Resent, StoredSet, Wanted,
+    RatesAction, RecordAction, RelocalizeAction, Reply, Resent, StoredSet, UtcTime, Wanted,
 };
 pub use to_wall::{
     CarInfo, Cause, CauseKind, Cell, ClockReply, ClockRequest, Cloud, CloudParticle, Comparison, Drops,

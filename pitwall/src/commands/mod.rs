@@ -11,6 +11,7 @@ mod record;
 mod replay;
 mod report;
 mod serve;
+mod sessions;
 mod watch;
 
 use std::process::ExitCode;
@@ -78,6 +79,11 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         },
         Verb::Fetch { car, to, rate, after } => fetch::run(&network, &car, to, rate, after, json).await,
         Verb::Merge { inputs, output } => merge::run(&inputs, &output, json),
+        Verb::Sessions {
+            words,
+            folder,
+            rebuild,
+        } => sessions::run(&folder, &words, rebuild, json),
         Verb::Replay { file, speed, at } => {
             let options = PageOptions {
                 address: page.address,

@@ -25,8 +25,6 @@ use crate::event::{EventPayload, FleetEvent};
 
 /// Messages of one file in memory.
 const AHEAD: usize = 512;
-/// What the car's program calls itself at the start of its files.
-const CAR_LIBRARY: &str = "car-node";
 
 /// The result of a merge.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -206,7 +204,7 @@ impl Known {
         let mut events = read_intact(&scan.path)?;
         while let Some(event) = events.next() {
             let event = event?;
-            scan.on_car = events.library().starts_with(CAR_LIBRARY);
+            scan.on_car = events.library().starts_with(super::CAR_LIBRARY);
             scan.first.get_or_insert_with(|| (event.car.clone(), event.at));
             if let EventPayload::Message { .. } = &event.payload {
                 scan.messages += 1;

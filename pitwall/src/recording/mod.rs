@@ -26,9 +26,13 @@ mod reader;
 mod recorder;
 mod recover;
 mod salvage;
+mod session_index;
 mod summary;
 mod unreadable;
 mod writer;
+
+/// What the car's program calls itself at the start of its files.
+const CAR_LIBRARY: &str = "car-node";
 
 pub use error::RecordingError;
 pub use fetch::{FetchError, FetchOptions, FetchProgress, Fetched, FileSource, fetch};
@@ -36,5 +40,6 @@ pub use merge::{Merged, MergedInput, merge};
 pub use reader::{Recording, read_events};
 pub use recorder::{Recorder, RecorderStatus, RecordingProgress};
 pub use recover::{Damage, Recovered, recover};
+pub use session_index::{Session, SessionIndex, SessionIndexError};
 pub use summary::{RecordingSummary, StreamSummary};
 pub use unreadable::{Unreadable, UnreadableCount};

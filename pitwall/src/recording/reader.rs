@@ -30,6 +30,7 @@ pub struct Recording {
     skipped: BTreeSet<String>,
     /// The program that made the file.
     library: String,
+    complete: bool,
     /// Damaged places are passed over, and noted here; None: they are errors.
     passed_over: Option<Vec<String>>,
 }
@@ -54,6 +55,7 @@ pub fn read_events(path: &Path) -> Result<Recording, RecordingError> {
         progress: Progress::Data,
         skipped: BTreeSet::new(),
         library: String::new(),
+        complete: false,
         passed_over: None,
     })
 }
@@ -92,6 +94,11 @@ impl Iterator for Recording {
 }
 
 impl Recording {
+    /// True when the end of the file has been read, and it is that of a complete one.
+    pub(super) fn complete(&self) -> bool {
+        self.complete
+    }
+
     /// The program that made the file; empty before the first event.
     pub(super) fn library(&self) -> &str {
         &self.library
@@ -118,7 +125,10 @@ impl Recording {
                     }
                 }
                 Salvaged::DataEnd => self.progress = Progress::Summary,
-                Salvaged::Complete => return Ok(None),
+                Salvaged::Complete => {
+                    self.complete = true;
+                    return Ok(None);
+                }
                 Salvaged::Damage(reason) => match &mut self.passed_over {
                     Some(passed_over) => passed_over.push(reason),
                     None => return Err(RecordingError::broken(&self.path, reason)),

@@ -7,6 +7,8 @@
 //! GET  /snapshot       one snapshot
 //! GET  /map/<car>      the map that a car localizes on
 //! POST /command        {car, operator, expected_revision, id, action}: returns the outcome of the command
+//! GET  /sessions?text= the recordings in the folder with these words
+//! POST /sessions/open  {file}: opens one for replay on a page of its own and returns its URL
 //! POST /record         {"on": true|false, "operator"}
 //! POST /mark           {car, operator, text}
 //! POST /acknowledge    {operator}: acknowledges every alarm so far
@@ -26,6 +28,7 @@ mod guard;
 mod operators;
 #[cfg(feature = "rerun")]
 mod rerun;
+mod sessions;
 mod snapshot;
 mod tracks;
 
@@ -51,6 +54,7 @@ use analysis::Sessions;
 pub(crate) use disk::free as free_space;
 use guard::Guard;
 use operators::Operators;
+use sessions::SessionList;
 use tracks::Tracks;
 
 /// Where the page is served and recordings go.
@@ -87,6 +91,8 @@ struct App {
     /// None when live.
     replay: Option<Arc<Replay>>,
     recordings: Arc<PathBuf>,
+    address: SocketAddr,
+    session_list: SessionList,
     disk_free: watch::Receiver<Option<u64>>,
     operators: Operators,
     tracks: Tracks,
@@ -151,6 +157,8 @@ impl Page {
             tracks: Tracks::new(&options.recordings),
             sessions: Sessions::default(),
             recordings: Arc::new(options.recordings),
+            address,
+            session_list: SessionList::default(),
             disk_free,
             operators: Operators::default(),
             stopping,
@@ -164,6 +172,8 @@ impl Page {
             .route("/command", post(api::command))
             .route("/record", post(api::record))
             .route("/mark", post(api::mark))
+            .route("/sessions", get(sessions::list))
+            .route("/sessions/open", post(sessions::open))
             .route("/acknowledge", post(api::acknowledge))
             .route("/analysis", get(analysis::view))
             .route("/analysis/lap", get(analysis::lap))
@@ -259,6 +269,7 @@ fn files() -> Router<App> {
         .route("/large.js", file(include_str!("page/large.js"), script))
         .route("/lists.js", file(include_str!("page/lists.js"), script))
         .route("/connection.js", file(include_str!("page/connection.js"), script))
+        .route("/sessions.js", file(include_str!("page/sessions.js"), script))
         .route("/sound.js", file(include_str!("page/sound.js"), script))
         .route("/track.js", file(include_str!("page/track.js"), script))
         .route("/icon.svg", file(include_str!("page/icon.svg"), "image/svg+xml"))

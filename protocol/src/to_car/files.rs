@@ -120,12 +120,32 @@ pub struct FileName {
 #[error("{0:?} is not the name of a car's recording, such as 000012_20260630-141500_car-1.mcap")]
 pub struct FileNameError(String);
 
-impl fmt::Display for FileName {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let seconds = self.started.div_euclid(SECOND);
+/// A time for people \[unix ns\]: `2026-06-30 14:15:00`, in UTC.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct UtcTime(pub i64);
+
+impl UtcTime {
+    /// Year, month, day, hours, minutes and seconds.
+    fn parts(self) -> [i64; 6] {
+        let seconds = self.0.div_euclid(SECOND);
         let (year, month, day) = date(seconds.div_euclid(DAY));
         let time = seconds.rem_euclid(DAY);
-        let (hours, minutes, seconds) = (time / 3600, time / 60 % 60, time % 60);
+        [year, month, day, time / 3600, time / 60 % 60, time % 60]
+    }
+}
+
+impl fmt::Display for UtcTime {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [year, month, day, hours, minutes, seconds] = self.parts();
+        f.pad(&format!(
+            "{year:04}-{month:02}-{day:02} {hours:02}:{minutes:02}:{seconds:02}"
+        ))
+    }
+}
+
+impl fmt::Display for FileName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [year, month, day, hours, minutes, seconds] = UtcTime(self.started).parts();
         let Self { number, car, .. } = self;
         write!(
             f,

@@ -10,6 +10,6 @@ pub use answer::{Answer, Candidate, Outcome, Reply, StoredSet};
 pub use command::{
     Action, Command, CommandId, IdError, ParamsAction, Rates, RatesAction, RecordAction, RelocalizeAction,
 };
-pub use files::{FileInfo, FileName, FileNameError, FilesReply, FilesRequest};
+pub use files::{FileInfo, FileName, FileNameError, FilesReply, FilesRequest, UtcTime};
 pub use link_report::LinkReport;
 pub use missing::{Kept, MissingReply, MissingRequest, Resent, Wanted};

@@ -7,6 +7,7 @@ import { Track, palette } from "/track.js";
 import { Log, showLaps, showNumbers, showStandings } from "/lists.js";
 import { Sound } from "/sound.js";
 import { Analysis } from "/analysis.js";
+import { SessionDialog } from "/sessions.js";
 
 const $ = (id) => document.getElementById(id);
 const press = (button, on) => button.setAttribute("aria-pressed", String(on));
@@ -35,6 +36,7 @@ async function act(car, action, expected = null) {
 const acts = {
   select,
   choose: (car, name, revision) => act(car, { params: { select: { name, revert_after_ms: null } } }, revision),
+  record: (car, on) => act(car, { record: on ? "start" : "stop" }),
   shadow: (car, name) => act(car, { params: { shadow: { name: name ?? null } } }),
   search,
   open: (car) => { select(car); large(true); },
@@ -364,8 +366,10 @@ for (const [word, [shape, , meaning]] of Object.entries(STATES)) $("legend").app
 const acknowledge = () => post("/acknowledge", { operator: operator.value });
 const fit = () => { follow(false); track.fit(); };
 const help = () => $("help").showModal();
+const sessions = new SessionDialog($("sessions"), { words: $("sessions-words"), table: $("sessions-table"), said: $("sessions-said") });
+const showSessions = () => sessions.open();
 const CLICKS = {
-  record, theme: otherTheme, "help-button": help, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
+  record, theme: otherTheme, "help-button": help, "sessions-button": showSessions, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
   mark, rerun, acknowledge, alarm: acknowledge, sound: () => sound.toggle(),
 };
 for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
@@ -378,7 +382,7 @@ const step = (by) => {
   document.querySelector(`.card[data-car="${car.car}"]`)?.scrollIntoView({ block: "nearest" });
 };
 const KEYS = {
-  r: record, t: otherTheme, "?": help, 0: fit, f: () => follow(), g: () => search(), m: mark, p: paint, s: shadow, o: () => large(),
+  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), g: () => search(), m: mark, p: paint, s: shadow, o: () => large(),
   v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,
   e: () => tab("log"), l: () => tab("laps"), u: () => tab("numbers"), d: () => tab("analysis"),
   "+": () => track.zoom(1.3), "=": () => track.zoom(1.3), "-": () => track.zoom(1 / 1.3),

@@ -64,6 +64,14 @@ export const FACTS = [
   ["missing", (c) => String(missing(c)), null, "messages that were sent and did not arrive"],
 ];
 
+/// The state of the recording on a car's own disk.
+export const recorderText = (state) => {
+  const gigabytes = (bytes) => fixed(bytes / 1e9, 2);
+  const what = !state.recording ? "not recording" : state.error ? `recording FAILS: ${state.error}` : `recording, file ${state.file}`;
+  const dropped = state.dropped ? `; ${state.dropped} messages not recorded` : "";
+  return `${what}; ${gigabytes(state.bytes)} of ${gigabytes(state.limit)} GB used, ${gigabytes(state.free)} GB free${dropped}`;
+};
+
 /// The set to compare with the one in force.
 export const otherSet = (car) => {
   const names = car.set?.available ?? [];

@@ -1,7 +1,7 @@
 // One car over the whole middle of the page: all causes, big numbers, two minutes of history, every set.
 
 import { plot } from "/chart.js";
-import { FACTS, STATES, colourOf, element, fixed, lasting, setText, verdict } from "/cards.js";
+import { FACTS, STATES, recorderText, colourOf, element, fixed, lasting, setText, verdict } from "/cards.js";
 
 const MORE = [
   ["spread along", (c) => fixed(c.health?.metrics?.spread_along, 3, " m"), (c) => c.health?.metrics?.spread_along > 0.4],
@@ -10,6 +10,7 @@ const MORE = [
   ["off the line", (c) => fixed(c.pose?.d_m, 2, " m")],
   ["lap", (c) => fixed(c.pose?.lap, 0)],
   ["memory", (c) => fixed(c.load && c.load.memory_process / 1e6, 0, " MB")],
+  ["on the car", (c) => !c.load?.recorder ? "–" : c.load.recorder.error ? "FAILS" : c.load.recorder.recording ? "recording" : "not recording", (c) => c.load?.recorder?.error || c.load?.recorder?.dropped > 0],
 ];
 
 const CHARTS = [
@@ -40,7 +41,9 @@ export class Large {
     this.since = element("span", "for");
     const close = element("button", "", "close (Esc)");
     close.addEventListener("click", () => acts.close());
-    headline.append(this.chip, this.name, this.state, this.since, close);
+    this.recorder = element("button");
+    this.recorder.addEventListener("click", () => acts.record(this.car, this.recorder.getAttribute("aria-pressed") !== "true"));
+    headline.append(this.chip, this.name, this.state, this.since, this.recorder, close);
     this.causes = element("ul");
     const big = element("div", "big");
     this.facts = [...FACTS, ...MORE].map(([label, text, off]) => {
@@ -84,8 +87,19 @@ export class Large {
       this.last = history.at(-1);
       for (const [canvas, options] of this.charts) plot(canvas, history, now, options);
     }
+    this.car = car.car;
+    this.updateRecorder(car.load?.recorder);
     this.updateSets(car);
     this.updateShadow(car);
+  }
+
+  /// The recording on the car's own disk.
+  updateRecorder(state) {
+    this.recorder.hidden = !state;
+    if (!state) return;
+    this.recorder.setAttribute("aria-pressed", String(state.recording));
+    setText(this.recorder, state.recording ? "■ stop recording on the car" : "● record on the car");
+    this.recorder.title = recorderText(state);
   }
 
   updateSets(car) {

@@ -1,6 +1,6 @@
 // The log, the laps, and every number of the selected car.
 
-import { colourOf, element, fixed, missing } from "/cards.js";
+import { colourOf, element, fixed, missing, recorderText } from "/cards.js";
 
 const SEVERITIES = ["info", "warning", "critical"];
 const LONGEST = 500;
@@ -173,6 +173,7 @@ export function showNumbers(table, car, pace) {
       add("scans, odometry", `${fixed(car.load.scan_rate, 1)}, ${fixed(car.load.odometry_rate, 1)} /s`);
       add("memory", fixed(car.load.memory_process / 1e6, 0, " MB"));
       add("queue", String(car.load.queue_depth));
+      if (car.load.recorder) add("on the car", recorderText(car.load.recorder));
       for (const [name, count] of Object.entries(car.load.drops)) if (count) add(`dropped: ${name.replaceAll("_", " ")}`, String(count));
     }
     const ms = (s) => fixed(s && s * 1e3, 2);

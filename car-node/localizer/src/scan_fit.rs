@@ -3,7 +3,7 @@
 /// The fit of one scan, or of several, smoothed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScanFit {
-    /// Share of the valid beams that end within 0.10 m of a wall, in [0, 1].
+    /// Share of the valid beams that end within 0.10 m of a wall (0.05 m and a cell where cells are larger), in [0, 1].
     pub alignment: f64,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
     pub residual: f64,

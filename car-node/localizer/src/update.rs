@@ -79,7 +79,7 @@ pub struct Update {
     pub spread: [f64; 2],
     /// Mass of the second cluster of particles over that of the first, in [0, 1] (clusters of 0.5 m and 20 deg).
     pub second_mode: f64,
-    /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall, in [0, 1]. A beam is valid that
+    /// Share of valid beams (about 60 over the full field) that end within 0.10 m of a wall (0.05 m and a cell where cells are larger), in [0, 1]. A beam is valid that
     /// has a return, and does not leave the mapped part of the world, as through a door that was shut when it was mapped.
     pub alignment: f64,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
@@ -108,6 +108,9 @@ pub struct Update {
     pub sensors: SensorFindings,
     /// Why the pose may be wrong; None while nothing speaks against it.
     pub doubt: Option<Doubt>,
+    /// Log of the odds that the pose is right, by how it was driven to and by its best rival, in [-25, 25]; None from a localizer that does
+    /// not judge its pose.
+    pub trust: Option<f64>,
 }
 
 /// A pose in doubt: a rival pose explains the scans as well or better, or the car seems to have been carried.

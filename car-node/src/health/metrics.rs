@@ -6,7 +6,7 @@ use synpf::Update;
 /// The numbers that a verdict is based on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Metrics {
-    /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in [0, 1].
+    /// Share of the valid beams that end within 0.10 m of a wall (0.05 m and a cell where cells are larger), smoothed, in [0, 1].
     pub alignment: f64,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m), smoothed \[m\].
     pub residual: f64,

@@ -64,6 +64,7 @@ pub(crate) mod tests_support {
             slip: 0.0,
             yaw_rate_residual: 0.0,
             doubt: None,
+            trust: None,
             sensors: synpf::SensorFindings::default(),
         }
     }

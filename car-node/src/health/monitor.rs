@@ -47,6 +47,8 @@ pub struct Monitor {
     wrong_since: Option<Stamp>,
     /// The localizer has given its pose up with the last scan.
     gave_up: bool,
+    /// The localizer has good reason to believe its pose, however badly scans fit.
+    trusted: bool,
     /// Since when nothing has been wrong.
     good_since: Option<Stamp>,
     /// Distance driven since the state was entered and since anything was wrong \[m\].
@@ -90,6 +92,7 @@ impl Monitor {
             lost_since: [None; Family::COUNT],
             wrong_since: None,
             gave_up: false,
+            trusted: false,
             good_since: None,
             driven: 0.0,
             last_update: None,
@@ -214,6 +217,7 @@ impl Monitor {
         self.verdict.update = update.number;
         self.verdict.metrics = Some(metrics);
         self.gave_up = update.mode == Mode::Searching;
+        self.trusted = update.trust.is_some_and(|trust| trust >= self.thresholds.trusted);
         self.advance(update.mode, pose_jump.is_some(), update.stamp, now);
         self.verdict.causes = self.causes(silent, now);
         &self.verdict
@@ -328,9 +332,11 @@ impl Monitor {
             .iter()
             .filter(|since| lasts(**since, t.lost_after))
             .count();
-        let wrong = families >= 2
-            || lasts(self.wrong_since, t.wrong_after)
-            || lasts(self.lost_since[Family::EndPoints as usize], t.alone_after);
+        // Scans that fit badly are no loss where they go on from those by which the car came here: then the map is wrong.
+        let wrong = !self.trusted
+            && (families >= 2
+                || lasts(self.wrong_since, t.wrong_after)
+                || lasts(self.lost_since[Family::EndPoints as usize], t.alone_after));
         let degraded = self.findings.iter().any(|finding| self.lasting(finding));
         let next = match (self.verdict.state, mode) {
             (State::Stale, _) => return,
@@ -510,6 +516,23 @@ mod tests {
         assert!(drive.kinds().contains(&CauseKind::LongBeams));
         let states = drive.drive(3.0, |_| ());
         assert_eq!(states, [State::Lost, State::Converging, State::Localized]);
+    }
+
+    /// Spectators seen through a net fitted as badly as a wrong pose: a right one was LOST for a third of the time.
+    #[test]
+    fn a_pose_that_the_localizer_has_reason_to_trust_is_degraded_by_its_fit_and_not_lost() {
+        let trusted = |trust| {
+            move |update: &mut Update| {
+                wrong_pose(update);
+                update.trust = Some(trust);
+            }
+        };
+        let mut drive = Drive::localized();
+        assert_eq!(
+            drive.drive(3.0, trusted(8.0)),
+            [State::Localized, State::Degraded]
+        );
+        assert_eq!(drive.drive(0.5, trusted(2.0)), [State::Degraded, State::Lost]);
     }
 
     #[test]

@@ -78,6 +78,8 @@ pub struct Thresholds {
     pub good_for: f64,
     /// A new pose is confirmed when everything was good while the car drove this far \[m\].
     pub confirmed_after: f64,
+    /// Log of the odds above which a localizer's own judgement keeps a pose from being lost by the fit of scans alone.
+    pub trusted: f64,
 }
 
 impl Default for Thresholds {
@@ -115,6 +117,7 @@ impl Default for Thresholds {
             alone_after: 2.0,
             good_for: 0.5,
             confirmed_after: 1.0,
+            trusted: 5.0,
         }
     }
 }

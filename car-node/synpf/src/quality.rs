@@ -9,7 +9,7 @@ use crate::track_map::TrackMap;
 /// The fit of one scan at one pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Quality {
-    /// Share of valid beams that end within 0.10 m of a wall.
+    /// Share of valid beams that end on a wall: within 0.05 m and the size of a cell, but no less than 0.10 m.
     pub(crate) alignment: f64,
     /// Mean of min(distance to the nearest wall, 1 m) \[m\].
     pub(crate) residual: f64,
@@ -25,8 +25,11 @@ const BEAMS: usize = 60;
 /// Beams whose range is compared with the map's, which costs more.
 const CAST: usize = 20;
 
-/// Nearer than this to a wall an end point is on it \[m\].
-const ALIGNED: f32 = 0.10;
+/// Nearer than this to a wall, and the size of a cell, an end point is on it \[m\].
+const ALIGNED: f32 = 0.05;
+
+/// Finer cells than this do not make a laser better \[m\].
+const LEAST_CELL: f64 = 0.05;
 
 /// A range this far from the map's is another thing \[m\].
 const OTHER: f32 = 0.3;
@@ -58,6 +61,7 @@ impl Quality {
     ) -> Self {
         let field = map.field();
         let cells = 1.0 / field.resolution() as f32;
+        let aligned_within = ALIGNED + field.resolution().max(LEAST_CELL) as f32;
         let stride = points.len().div_ceil(BEAMS).max(1);
         let (sin, cos) = pose.heading.sin_cos();
         let (sin, cos) = (sin as f32, cos as f32);
@@ -75,7 +79,7 @@ impl Quality {
                 .from_wall(px * cells, py * cells)
                 .map_or(1.0, |d| d.min(1.0));
             count += 1.0;
-            if distance < ALIGNED {
+            if distance < aligned_within {
                 aligned += 1.0;
             } else if map.unmapped([lx, ly], [px, py]) {
                 unmapped += 1.0;

@@ -227,6 +227,9 @@ const AS_USUAL: f64 = 0.75;
 /// A lead this many times as large as is needed is believed of a car that stands, after so long \[s\].
 const STANDING: (f64, f64) = (2.0, 0.3);
 
+/// Log odds beyond which no more is said.
+const MOST_TRUST: f64 = 25.0;
+
 /// A correction of the prediction larger than this is no motion of the car \[m\].
 const PLAUSIBLE: f64 = 0.3;
 
@@ -301,6 +304,15 @@ impl Recovery {
     /// Why the pose is in doubt; None while it is not.
     pub(crate) fn doubt(&self) -> Option<InDoubt> {
         self.doubt
+    }
+
+    /// Log of the odds that the pose is right: by its history, and by the best rival's lead. Negative during a search.
+    pub(crate) fn trust(&self) -> f64 {
+        if self.search.is_some() {
+            return -MOST_TRUST;
+        }
+        let lead = self.rivals.best().map_or(0.0, |rival| rival.lead().max(0.0));
+        (self.loss.odds() - self.parameters.piece_odds * lead).clamp(-MOST_TRUST, MOST_TRUST)
     }
 
     /// Short-term over long-term average of the clear alignment: below 1 when scans fit worse than they used to. Augmented

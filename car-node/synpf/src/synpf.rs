@@ -389,6 +389,7 @@ impl SynPf {
                 probability: doubt.probability,
                 rival: doubt.rival.map(|pose| map_from_grid * pose),
             }),
+            trust: Some(self.recovery.trust()),
             sensors: self.sensor_findings(),
         }
     }

@@ -276,7 +276,7 @@ pub enum Severity {
 /// What was measured at an update.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Metrics {
-    /// Share of the valid beams that end within 0.10 m of a wall, smoothed, in `[0, 1]`.
+    /// Share of the valid beams that end within 0.10 m of a wall (0.05 m and a cell where cells are larger), smoothed, in `[0, 1]`.
     pub alignment: f32,
     /// Mean over the same beams of min(distance to the nearest wall, 1 m) \[m\].
     pub residual: f32,

@@ -405,6 +405,7 @@ impl Reference {
             slip: 0.0,
             yaw_rate_residual: 0.0,
             doubt: None,
+            trust: None,
             sensors: SensorFindings::default(),
         }
     }

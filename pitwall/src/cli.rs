@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
-use pitwall::Replay;
+use pitwall::{RecorderOptions, Replay};
 use protocol::{CarName, Pose2, Rates};
 
 use crate::network::endpoint;
@@ -38,6 +38,8 @@ pub(crate) struct Page {
     /// Folder for the recordings that are started from the page.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     pub(crate) recordings: PathBuf,
+    #[command(flatten)]
+    pub(crate) recorder: RecorderArguments,
     /// Also write the data for the Rerun viewer into this file.
     #[cfg(feature = "rerun")]
     #[arg(long, value_name = "FILE.rrd")]
@@ -48,6 +50,34 @@ pub(crate) struct Page {
     pub(crate) rerun_connect: Option<String>,
 }
 
+/// How to record.
+#[derive(Debug, Args)]
+pub(crate) struct RecorderArguments {
+    /// Begin another file when one has this size, such as 500MB or 2GB.
+    #[arg(long, global = true, help_heading = RECORDING, value_name = "SIZE", value_parser = size)]
+    pub(crate) split_size: Option<u64>,
+    /// Begin another file after this time, such as 10m.
+    #[arg(long, global = true, help_heading = RECORDING, value_name = "TIME", allow_hyphen_values = true, value_parser = split_time)]
+    pub(crate) split_time: Option<Duration>,
+    /// Folder to go on in when the file cannot be written any more: the disk is full, or is gone.
+    #[arg(long, global = true, help_heading = RECORDING, value_name = "FOLDER")]
+    pub(crate) spare: Option<PathBuf>,
+}
+
+impl RecorderArguments {
+    /// The options for a recording of this operator.
+    pub(crate) fn options(&self, operator: String) -> RecorderOptions {
+        RecorderOptions {
+            split_bytes: self.split_size,
+            split_after: self.split_time,
+            spare: self.spare.clone(),
+            operator,
+        }
+    }
+}
+
+const RECORDING: &str = "Recording";
+
 /// Heading of the options that every command accepts.
 const GLOBAL: &str = "Global options";
 
@@ -55,7 +85,7 @@ const EXIT_CODES: &str = "Without --listen and --connect, the program joins the 
 runs, it listens for the cars itself on tcp/0.0.0.0:7447.
 
 Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict, \
-7 recovered with losses.";
+7 data is lost or missing.";
 
 #[derive(Debug, Args)]
 pub(crate) struct NetworkOptions {
@@ -145,8 +175,8 @@ pub(crate) enum Verb {
     },
     /// Record all cars into an MCAP file until interrupted, or have a car record on its own disk.
     Record {
-        /// The new file. Existing files are never overwritten.
-        #[arg(short, long, value_name = "FILE", required_unless_present = "on_car")]
+        /// The new file. Existing files are never overwritten [default: the time and the track, in the folder --recordings].
+        #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
         #[command(flatten)]
         on_car: OnCar,
@@ -210,6 +240,11 @@ pub(crate) enum Verb {
         /// Another recording, whose laps are laid over these; may be given several times.
         #[arg(long, value_name = "FILE")]
         with: Vec<PathBuf>,
+    },
+    /// List what each car published, what is here and what is missing, from when to when. The exit code is 0 only if nothing is.
+    Check {
+        /// The recording.
+        file: PathBuf,
     },
     /// Write a recording's poses, truth, health and laps as CSV files.
     Export {
@@ -377,6 +412,33 @@ fn byte_rate(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("{text:?} is not a rate from 1k to 1000M bytes per second"))
 }
 
+/// `500MB`, `2GB`, or a number of bytes.
+fn size(text: &str) -> Result<u64, String> {
+    let split = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(split);
+    let scale = match unit.to_ascii_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "kb" => 1e3,
+        "mb" => 1e6,
+        "gb" => 1e9,
+        _ => return Err(format!("unknown unit {unit:?}; use MB or GB")),
+    };
+    let bytes = number.trim().parse::<f64>().ok().map(|number| number * scale);
+    let bytes = bytes.filter(|bytes| (1e6..=1e15).contains(bytes));
+    bytes
+        .map(|bytes| bytes as u64)
+        .ok_or_else(|| format!("{text:?} is not a size of 1 MB or more, such as 500MB or 2GB"))
+}
+
+/// A time after which a file is split.
+fn split_time(text: &str) -> Result<Duration, String> {
+    let time = duration(text)?;
+    if time < Duration::from_secs(1) {
+        return Err("the time must be 1 s or more".to_owned());
+    }
+    Ok(time)
+}
+
 /// Updates per second.
 fn views(text: &str) -> Result<f64, String> {
     let views = text.parse().ok().filter(|rate| (0.01..=100.0).contains(rate));
@@ -480,6 +542,17 @@ mod tests {
             let error = Cli::try_parse_from(["pitwall"].into_iter().chain(call.split(' ')));
             let text = error.expect_err(call).to_string();
             assert!(text.contains(&format!("for '{option} ")), "{call}: {text}");
+        }
+    }
+
+    #[test]
+    fn sizes_are_read_as_people_write_them() {
+        assert_eq!(
+            [size("500MB"), size("2gb"), size("1000000")],
+            [Ok(500_000_000), Ok(2_000_000_000), Ok(1_000_000)]
+        );
+        for text in ["", "MB", "-1GB", "1TB", "NaN", "10", "infGB"] {
+            assert!(size(text).is_err(), "{text}");
         }
     }
 

@@ -119,7 +119,7 @@ impl fmt::Display for Rejection {
 }
 
 /// Sequence numbers of a stream that were sent and have not been released yet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SentRange {
     /// The stream's topic.
     pub topic: Topic,

@@ -96,7 +96,7 @@ impl EventBus {
     pub fn recording(&self) -> Option<(PathBuf, RecordingProgress)> {
         let state = self.lock();
         let recorder = state.recorder.as_ref()?;
-        Some((recorder.path().to_owned(), recorder.progress()))
+        Some((recorder.path(), recorder.progress()))
     }
 
     /// The state of the current recording; None when nothing is being recorded.

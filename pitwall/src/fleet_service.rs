@@ -6,16 +6,19 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::Receiver;
-use protocol::CarName;
+use protocol::{CarName, Severity};
+use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use crate::clock::unix_now;
+use crate::clock::{stepped, system_now, unix_now};
 use crate::event::{EventPayload, FleetEvent};
 use crate::event_bus::{EventBus, FleetGuard};
 use crate::fleet::Fleet;
 use crate::network::gap_recovery::Outstanding;
 use crate::network::{Client, Connection, ConnectionError, Role};
-use crate::recording::{Recorder, RecorderStatus, RecordingError, RecordingSummary};
+use crate::recording::{
+    Recorder, RecorderOptions, RecorderStatus, RecordingError, RecordingSummary, session_name,
+};
 
 /// A running pit wall. Cheap to share.
 pub struct FleetService {
@@ -24,6 +27,8 @@ pub struct FleetService {
     periodic_tasks: Mutex<Option<JoinHandle<()>>>,
     /// Cars whose map and info are being fetched. Over a slow link a fetch takes longer than the period of the fetches.
     fetching: Mutex<BTreeSet<CarName>>,
+    /// Why the last recording has failed; None while it has not.
+    recording_failure: watch::Sender<Option<String>>,
 }
 
 impl FleetService {
@@ -48,6 +53,7 @@ impl FleetService {
             bus,
             periodic_tasks: Mutex::default(),
             fetching: Mutex::default(),
+            recording_failure: watch::Sender::new(None),
         });
         let task = tokio::spawn(run_periodic_tasks(Arc::downgrade(&service)));
         *service
@@ -104,20 +110,105 @@ impl FleetService {
 
     /// Starts a recording of all cars. It begins with the known maps, info and clock offsets.
     pub async fn start_recording(&self, path: &Path) -> Result<(), StartRecordingError> {
+        self.start_recording_with(path, RecorderOptions::default()).await
+    }
+
+    /// The name of a recording that starts now: the time and the track.
+    pub fn session_name(&self) -> String {
+        let fleet = self.fleet();
+        let track = fleet
+            .cars()
+            .find_map(|car| car.map.as_ref().map(|(map, _)| map.name.clone()));
+        session_name(system_now(), track.as_deref())
+    }
+
+    /// Starts a recording of all cars with options.
+    pub async fn start_recording_with(
+        &self,
+        path: &Path,
+        options: RecorderOptions,
+    ) -> Result<(), StartRecordingError> {
         if self.bus.recording().is_some() {
             return Err(StartRecordingError::Recording);
         }
-        let recorder = Recorder::start(path)?;
+        let recorder = Recorder::start_with(path, options)?;
+        let file = recorder.path();
+        self.recording_failure.send_replace(None);
         if let Err(rejected) = self.bus.attach_recorder(recorder, unix_now()) {
             // Another recording has started since the check. The new file is empty.
             drop(rejected);
-            if let Err(error) = std::fs::remove_file(path) {
-                tracing::warn!(file = %path.display(), %error, "an empty recording is left");
+            if let Err(error) = std::fs::remove_file(&file) {
+                tracing::warn!(file = %file.display(), %error, "an empty recording is left");
             }
             return Err(StartRecordingError::Recording);
         }
+        // What was sent since an earlier recording is not missing.
+        self.fleet().forget_recorded();
         self.connection.subscribe_recorded(true).await?;
         Ok(())
+    }
+
+    /// Waits until the recording fails, and returns the error. Never returns while it goes on, or when there is none.
+    pub async fn recording_failed(&self) -> String {
+        let mut failure = self.recording_failure.subscribe();
+        loop {
+            if let Some(error) = failure.borrow_and_update().clone() {
+                return error;
+            }
+            if failure.changed().await.is_err() {
+                return std::future::pending().await;
+            }
+        }
+    }
+
+    /// An alarm when the recording has moved to the spare folder.
+    fn note_moved_recording(&self, noted: &mut Option<String>) {
+        let recording = self.bus.recording();
+        let moved = recording
+            .as_ref()
+            .and_then(|(_, progress)| progress.moved.clone());
+        if moved != *noted
+            && let (Some(error), Some((file, _))) = (&moved, &recording)
+        {
+            let text = format!("RECORDING MOVED: {error}; it goes on in {}", file.display());
+            self.fleet()
+                .add_entry(unix_now(), None, Severity::Critical, "recorder", text, None);
+        }
+        *noted = moved;
+    }
+
+    /// Ends a recording that has failed: an alarm, and the next one can be started.
+    async fn end_failed_recording(&self) {
+        let Some(error) = self.bus.recording().and_then(|(_, progress)| progress.error) else {
+            return;
+        };
+        let file = self.recording_path().unwrap_or_default();
+        tracing::error!(file = %file.display(), %error, "recording has failed");
+        let text = format!("RECORDING FAILED: {error}; start another one, on another disk if need be");
+        self.fleet()
+            .add_entry(unix_now(), None, Severity::Critical, "recorder", text, None);
+        if let Some(Ok(_)) = self.cut_recording().await {
+            tracing::warn!("the recording was completed although it had failed");
+        }
+        self.recording_failure.send_replace(Some(error));
+    }
+
+    /// Notes that the laptop's clock was set.
+    fn note_clock_step(&self, noted: &mut i64) {
+        const STEP: i64 = 500_000_000;
+        let stepped = stepped();
+        if (stepped - *noted).abs() < STEP {
+            return;
+        }
+        let by = (stepped - *noted) as f64 * 1e-9;
+        *noted = stepped;
+        let text = format!("the laptop's clock was set by {by:+.1} s; times here go on without that step");
+        tracing::warn!("{text}");
+        let cars: Vec<_> = self.fleet().cars().map(|car| car.name.clone()).collect();
+        for car in cars {
+            let (who, text) = ("pitwall".into(), text.as_str().into());
+            self.client().emit(&car, EventPayload::Marker { who, text });
+        }
     }
 
     /// Ends the recording and returns its summary; None when nothing was being recorded. A final sync with every car
@@ -167,15 +258,9 @@ impl FleetService {
         self.bus.recording().map(|(path, _)| path)
     }
 
-    /// Marks this moment in the log and the recording.
-    pub fn mark(&self, car: &CarName, who: &str, text: &str) {
-        self.client().emit(
-            car,
-            EventPayload::Marker {
-                who: who.into(),
-                text: text.into(),
-            },
-        );
+    /// Marks this moment in the logs and the recordings of all pit walls on this network.
+    pub async fn mark(&self, car: &CarName, who: &str, text: &str) {
+        self.client().mark(car, who, text).await;
     }
 
     /// Ends the recording, if there is one, and closes the connection.
@@ -200,6 +285,8 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
     let mut ticks = tokio::time::interval(FleetService::TICK);
     let mut compared: Option<Instant> = None;
     let mut reported: Option<Instant> = None;
+    let mut clock_step = stepped();
+    let mut moved = None;
     loop {
         ticks.tick().await;
         let Some(service) = service.upgrade() else {
@@ -215,6 +302,9 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
         };
         if reported.is_none_or(|at| at.elapsed() >= FleetService::REPORT_LINKS) {
             reported = Some(Instant::now());
+            service.note_clock_step(&mut clock_step);
+            service.note_moved_recording(&mut moved);
+            service.end_failed_recording().await;
             let now = unix_now();
             let reports: Vec<_> = service
                 .fleet()

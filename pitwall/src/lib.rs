@@ -76,10 +76,11 @@ pub use network::{
 };
 pub use program::program;
 pub use recording::{
-    Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, Merged, MergedInput, Recorder,
-    RecorderStatus, Recording, RecordingError, RecordingProgress, RecordingSummary, Recovered, Session,
-    SessionIndex, SessionIndexError, StreamSummary, Unreadable, UnreadableCount, fetch, merge, read_events,
-    recover,
+    CarCheck, Check, Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, GapCheck, InOrder,
+    Merged, MergedInput, Recorder, RecorderOptions, RecorderStatus, Recording, RecordingError,
+    RecordingProgress, RecordingSummary, Recovered, Session, SessionIndex, SessionIndexError, StreamCheck,
+    StreamSummary, Unreadable, UnreadableCount, check, fetch, merge, missing_content, read_events,
+    read_in_order, recover, session_name,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -9,7 +9,7 @@ use serde::Serialize;
 use crate::event::FleetEvent;
 use crate::event_bus::EventBus;
 use crate::fleet::Fleet;
-use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
+use crate::recording::{RecordingError, Survey, Unreadable, UnreadableCount, read_events, survey};
 
 /// A recording that is being played.
 pub struct Replay {
@@ -18,6 +18,7 @@ pub struct Replay {
     /// When the first and the last event arrived \[unix ns\].
     span: (i64, i64),
     unreadable: Vec<Unreadable>,
+    survey: Survey,
     playhead: Mutex<Playhead>,
     changed: Condvar,
 }
@@ -85,6 +86,7 @@ impl Replay {
             path: path.to_owned(),
             span,
             unreadable: unreadable.list(),
+            survey: survey(path)?,
             playhead: Mutex::new(Playhead {
                 playing: true,
                 speed: 1.0,
@@ -95,6 +97,7 @@ impl Replay {
             }),
             changed: Condvar::new(),
         });
+        replay.survey.prepare_replay(&mut replay.bus.fleet());
         let player = replay.clone();
         std::thread::Builder::new()
             .name("replay".to_owned())
@@ -210,16 +213,13 @@ impl Replay {
 
     /// Applies all events up to `to` \[unix ns\] to a new fleet and shows that fleet.
     fn jump(&self, to: i64) -> Result<PeekedEvents, RecordingError> {
-        const TICK: i64 = 100_000_000;
         let mut events = PeekedEvents::open(&self.path)?;
         let mut fleet = Fleet::default();
+        self.survey.prepare_replay(&mut fleet);
         let mut ticked = self.span.0;
         while let Some(event) = events.next_until(to)? {
             // Time passes as it did, so that a car is BLIND where it was.
-            while ticked + TICK < event.at {
-                ticked += TICK;
-                fleet.tick(ticked);
-            }
+            fleet.tick_between(&mut ticked, event.at);
             fleet.apply(&event);
         }
         fleet.tick(to);

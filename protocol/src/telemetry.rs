@@ -33,6 +33,11 @@ pub enum Telemetry {
 }
 
 impl Telemetry {
+    /// True for topics that carry telemetry.
+    pub fn carried_by(topic: Topic) -> bool {
+        Self::decode(topic, &[]).is_some()
+    }
+
     /// Decodes a message that arrived on `topic`. None for topics without telemetry.
     pub fn decode(topic: Topic, bytes: &[u8]) -> Option<Result<(Header, Self), CodecError>> {
         fn with<M: crate::Message>(

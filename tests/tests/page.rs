@@ -37,6 +37,7 @@ impl TestBench {
             page: PageOptions {
                 address: ([127, 0, 0, 1], 0).into(),
                 recordings: recordings.path().to_owned(),
+                ..PageOptions::default()
             },
         })
         .await

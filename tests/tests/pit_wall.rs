@@ -215,6 +215,14 @@ async fn a_recording_of_three_cars_holds_every_message() {
     }
     assert_eq!(replayed.cars().count(), 3);
 
+    // The check finds nothing missing.
+    let check = pitwall::check(&file).expect("a good file");
+    assert!(check.complete && check.cars.len() == 3, "{check}");
+    assert!(check.to_string().ends_with("nothing is missing"), "{check}");
+    for stream in check.cars.iter().flat_map(|car| &car.streams) {
+        assert_eq!(stream.published, stream.received, "{check}");
+    }
+
     // What a report makes of it stands alone.
     let report = Report::of(&file).expect("a good file");
     assert_eq!(report.cars.len(), 3);
@@ -492,5 +500,80 @@ async fn two_cars_of_one_name_are_an_alarm() {
     other.leave().await;
     wait_until("the end of the alarm", || !alarmed()).await;
     assert_eq!(service.fleet().log().alarms(), 1);
+    service.close().await;
+}
+
+// Only the pit wall whose page set a marker once had it in its recording.
+#[tokio::test(flavor = "multi_thread")]
+async fn markers_are_in_every_recording_and_a_second_recording_misses_nothing() {
+    let (endpoint, service, folder, _first) = recording().await;
+    let car = FakeCar::start("car-1", &endpoint, Behaviour::default()).await;
+    assert!(service.wait_for(car.name(), DEADLINE).await);
+    let received = |least: u64| {
+        let status = service.recording();
+        status.is_some_and(|status| status.summary.messages > least)
+    };
+    wait_until("messages", || received(200)).await;
+    service
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("good");
+
+    let other = FleetService::open(&client(&endpoint)).await.expect("a link");
+    assert!(other.wait_for(car.name(), DEADLINE).await);
+    let files = ["a.mcap", "b.mcap"].map(|name| folder.path().join(name));
+    service.start_recording(&files[0]).await.expect("a new file");
+    other.start_recording(&files[1]).await.expect("a new file");
+    service.mark(car.name(), "ana", "crash in turn 3").await;
+    let marked = |service: &FleetService| {
+        let fleet = service.fleet();
+        fleet.log().since(0).any(|entry| entry.text == "crash in turn 3")
+    };
+    wait_until("the marker", || marked(&service) && marked(&other)).await;
+    wait_until("messages", || received(200)).await;
+    let view = service.fleet().car(car.name()).map(|car| car.view(unix_now()));
+    let view = view.expect("the car is there");
+    assert_eq!(
+        view.missing, 0,
+        "what was sent between the recordings is not missing"
+    );
+    for (service, file) in [(&service, &files[0]), (&other, &files[1])] {
+        let summary = service
+            .stop_recording()
+            .await
+            .expect("a recording")
+            .expect("good");
+        assert_eq!(summary.missing(), 0, "{summary}");
+        let markers = read_events(file).expect("good").filter(|event| {
+            matches!(
+                event.as_ref().map(|event| &event.payload),
+                Ok(pitwall::EventPayload::Marker { .. })
+            )
+        });
+        assert_eq!(markers.count(), 1);
+    }
+    other.close().await;
+    service.close().await;
+}
+
+// A recording whose file was gone once went on without a word.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_failed_recording_is_an_alarm_and_another_one_can_be_started() {
+    let (_endpoint, service, folder, file) = recording().await;
+    std::fs::remove_file(&file).expect("removed");
+    let error = tokio::time::timeout(DEADLINE, service.recording_failed()).await;
+    assert!(error.expect("it fails").contains("session.mcap"));
+    assert_eq!(service.fleet().log().alarms(), 1);
+    assert!(service.recording().is_none());
+    service
+        .start_recording(&folder.path().join("again.mcap"))
+        .await
+        .expect("a new file");
+    service
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("good");
     service.close().await;
 }

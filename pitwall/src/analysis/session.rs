@@ -7,7 +7,7 @@ use protocol::CarName;
 
 use super::{CarLaps, LapBook, MapCheck};
 use crate::fleet::Fleet;
-use crate::recording::{RecordingError, read_events};
+use crate::recording::RecordingError;
 
 /// The laps of all cars in one session.
 #[derive(Debug, Clone, Default)]
@@ -40,7 +40,9 @@ impl SessionLaps {
     /// Reads a whole recording.
     pub(crate) fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut fleet = Fleet::default();
-        for event in read_events(path)? {
+        let events = crate::report::read(path)?;
+        events.prepare(&mut fleet);
+        for event in events {
             fleet.apply(&event?);
         }
         Ok(Self::new(path, &fleet))

@@ -1,4 +1,7 @@
-//! `pitwall export`: poses and laps as CSV, for spreadsheets and notebooks.
+//! `pitwall export`: poses, truth, health and laps as CSV, for spreadsheets and notebooks.
+//!
+//! The rows of each car are in the order of publishing, with what was recovered later in its place. Nothing is kept in memory
+//! but messages that stand late in the file.
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -6,17 +9,30 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use pitwall::{EventPayload, Fleet, RecordingError, UnreadableCount, read_events};
+use pitwall::{EventPayload, Fleet, InOrder, RecordingError, UnreadableCount, read_in_order};
 use protocol::{Telemetry, Topic};
 use serde_json::json;
 
 use super::BadUsage;
 use crate::output;
 
+/// The topics that are exported.
+fn wanted(topic: Topic) -> bool {
+    matches!(
+        topic,
+        Topic::Pose
+            | Topic::RecordedPose
+            | Topic::Health
+            | Topic::RecordedHealth
+            | Topic::RecordedTruth
+            | Topic::Event
+    )
+}
+
 pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
     let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
-    // Read completely before anything is written, so that a damaged recording leaves no files.
-    let events = read_events(file)?.collect::<Result<Vec<_>, _>>()?;
+    // This reads the whole file, so that a damaged recording leaves no files.
+    let events = read_in_order(file, wanted)?;
     if events.is_empty() {
         return Err(RecordingError::Empty(file.display().to_string()).into());
     }
@@ -25,6 +41,33 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
         return Err(BadUsage(format!("{folder} exists already; nothing is overwritten")).into());
     }
     fs::create_dir(&folder).with_context(|| folder.display().to_string())?;
+    let Written {
+        counts: [poses, truths, healths, laps],
+        unreadable,
+    } = write(events, &folder)?;
+    let unreadable = unreadable.list();
+    super::print_unreadable(&unreadable);
+    if json {
+        output::print_json(&json!({
+            "folder": folder, "poses": poses, "truths": truths, "healths": healths, "laps": laps,
+            "unreadable": unreadable,
+        }))?;
+    } else {
+        output::print(&format!(
+            "{}: {poses} poses, {truths} true poses, {healths} health messages, {laps} laps",
+            folder.display()
+        ));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+struct Written {
+    /// Poses, true poses, health messages and laps.
+    counts: [u64; 4],
+    unreadable: UnreadableCount,
+}
+
+fn write(events: InOrder, folder: &Path) -> anyhow::Result<Written> {
     let create = |name: &str, head: &str| -> anyhow::Result<BufWriter<File>> {
         let path = folder.join(name);
         let mut out = BufWriter::new(File::create_new(&path).with_context(|| path.display().to_string())?);
@@ -32,30 +75,29 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
         Ok(out)
     };
     let head =
-        "car,sensor_unix_ns,arrived_unix_ns,x_m,y_m,heading_rad,speed_mps,yaw_rate_radps,s_m,d_m,lap,update";
+        "car,sensor_unix_ns,laptop_unix_ns,x_m,y_m,heading_rad,speed_mps,yaw_rate_radps,s_m,d_m,lap,update";
     let mut poses = create("poses.csv", head)?;
     let head = "car,sensor_unix_ns,x_m,y_m,heading_rad";
     let mut truths = create("truth.csv", head)?;
     let head = "car,sensor_unix_ns,state,alignment,residual_m,slip,spread_along_m,spread_across_m,particles";
     let mut healths = create("health.csv", head)?;
     let mut fleet = Fleet::default();
+    events.prepare(&mut fleet);
     let mut unreadable = UnreadableCount::default();
-    let mut counts = [0_u64; 3];
-    for event in &events {
-        fleet.apply(event);
-        unreadable.add(event);
+    let mut counts = [0_u64; 4];
+    for event in events {
+        let event = event?;
+        fleet.apply(&event);
+        unreadable.add(&event);
         let EventPayload::Message {
-            topic,
-            header,
-            telemetry,
-            ..
+            header, telemetry, ..
         } = &event.payload
         else {
             continue;
         };
         let (car, sensor) = (&event.car, header.sensor);
-        match (&**telemetry, topic) {
-            (Telemetry::Pose(p), Topic::Pose) => {
+        match &**telemetry {
+            Telemetry::Pose(p) => {
                 let place = p
                     .track
                     .map_or_else(|| ",".to_owned(), |track| format!("{},{}", track.s, track.d));
@@ -67,7 +109,7 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
                 )?;
                 counts[0] += 1;
             }
-            (Telemetry::Truth(t), _) => {
+            Telemetry::Truth(t) => {
                 writeln!(
                     truths,
                     "{car},{sensor},{},{},{}",
@@ -75,7 +117,7 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
                 )?;
                 counts[1] += 1;
             }
-            (Telemetry::Health(h), Topic::Health) => {
+            Telemetry::Health(h) => {
                 let numbers = h.metrics.map_or_else(
                     || ",,,,,".to_owned(),
                     |m| {
@@ -91,27 +133,13 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
             _ => {}
         }
     }
-    let head = "car,lap,time_s,s1_s,s2_s,s3_s,set,slipping,worst_slip,alignment,lateral_m";
+    let head = "car,lap,time_s,void,s1_s,s2_s,s3_s,set,slipping,worst_slip,alignment,lateral_m";
     let mut laps = create("laps.csv", head)?;
-    let lap_count = write_laps(&mut laps, &fleet)?;
+    counts[3] = write_laps(&mut laps, &fleet)?;
     for mut out in [poses, truths, healths, laps] {
         out.flush().with_context(|| folder.display().to_string())?;
     }
-    let [poses, truths, healths] = counts;
-    let unreadable = unreadable.list();
-    super::print_unreadable(&unreadable);
-    if json {
-        output::print_json(&json!({
-            "folder": folder, "poses": poses, "truths": truths, "healths": healths, "laps": lap_count,
-            "unreadable": unreadable,
-        }))?;
-    } else {
-        output::print(&format!(
-            "{}: {poses} poses, {truths} true poses, {healths} health messages, {lap_count} laps",
-            folder.display()
-        ));
-    }
-    Ok(ExitCode::SUCCESS)
+    Ok(Written { counts, unreadable })
 }
 
 /// Writes one line per lap; returns the number of laps.
@@ -124,10 +152,11 @@ fn write_laps(laps: &mut impl Write, fleet: &Fleet) -> std::io::Result<u64> {
             let [s1, s2, s3] = lap.sectors_s.map(or_empty);
             writeln!(
                 laps,
-                "{},{},{},{s1},{s2},{s3},{},{},{},{},{}",
+                "{},{},{},{},{s1},{s2},{s3},{},{},{},{},{}",
                 car.name,
                 lap.lap,
                 lap.time_s,
+                lap.void.unwrap_or_default(),
                 lap.set,
                 grip(|g| g.slipping),
                 grip(|g| g.worst_slip),

@@ -1,6 +1,7 @@
 //! The commands.
 
 mod cars;
+mod check;
 mod control;
 mod events;
 mod export;
@@ -65,8 +66,8 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let patience = if follow { wait } else { FIND };
             events::run(&network, car, follow, patience, json).await
         }
-        Verb::Record { output, on_car, time } => match (on_car.on_car, output) {
-            (Some(car), _) => {
+        Verb::Record { output, on_car, time } => match on_car.on_car {
+            Some(car) => {
                 let action = match (on_car.stop, on_car.state) {
                     (true, _) => RecordAction::Stop,
                     (false, true) => RecordAction::Get,
@@ -74,8 +75,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
                 };
                 control::send_command(&network, &car, Action::Record(action), None, json).await
             }
-            (None, Some(output)) => record::record(&network, &output, time, json).await,
-            (None, None) => Err(BadUsage("record needs --output or --on-car".to_owned()).into()),
+            None => record::record(&network, output, &page, time, json).await,
         },
         Verb::Fetch { car, to, rate, after } => fetch::run(&network, &car, to, rate, after, json).await,
         Verb::Merge { inputs, output } => merge::run(&inputs, &output, json),
@@ -88,10 +88,12 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let options = PageOptions {
                 address: page.address,
                 recordings: page.recordings,
+                ..PageOptions::default()
             };
             replay::run(&file, options, speed, at.as_secs_f64(), json).await
         }
         Verb::Report { file, output, with } => report::run(&file, output, &with, json),
+        Verb::Check { file } => check::run(&file, json),
         Verb::Export { file, output } => export::run(&file, output, json),
         Verb::Recover { file, output } => record::recover(&file, output, json),
     }

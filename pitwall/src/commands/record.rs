@@ -8,23 +8,36 @@ use anyhow::Context;
 use pitwall::{FleetService, RecordingError, RecordingSummary, Recovered};
 
 use super::{FIND, NO_SUCH_CAR, open, time_or_interrupt};
-use crate::cli::NetworkOptions;
+use crate::cli::{NetworkOptions, Page};
 use crate::output;
 
-/// Exit code: something in the file could not be saved.
-const DATA_LOST: u8 = 7;
+/// Exit code: something in the file could not be saved, or is missing.
+pub(super) const DATA_LOST: u8 = 7;
 
 /// A recording that takes longer than this to end prints why.
 const QUIET: Duration = Duration::from_millis(600);
 
 pub(super) async fn record(
     network: &NetworkOptions,
-    file: &Path,
+    file: Option<PathBuf>,
+    page: &Page,
     time: Option<Duration>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let service = open(network).await?;
-    service.start_recording(file).await?;
+    let file = if let Some(file) = file {
+        file
+    } else {
+        // The name has the track, which the first car knows.
+        let has_map = |fleet: &pitwall::Fleet| fleet.cars().any(|car| car.map.is_some());
+        tokio::select! {
+            _ = service.wait_until(FIND, has_map) => {}
+            () = super::interrupted() => return Ok(ExitCode::from(NO_SUCH_CAR)),
+        }
+        page.recordings.join(service.session_name())
+    };
+    let options = page.recorder.options(network.operator());
+    service.start_recording_with(&file, options).await?;
     let waiting = service.wait_until(FIND, |fleet| fleet.cars().any(|car| car.alive));
     tokio::select! {
         found = waiting => if !found {
@@ -34,9 +47,15 @@ pub(super) async fn record(
     }
     output::print_note(&format!(
         "recording all cars into {}; Ctrl-C stops it",
-        file.display()
+        service.recording_path().unwrap_or_else(|| file.clone()).display()
     ));
-    time_or_interrupt(time).await;
+    tokio::select! {
+        () = time_or_interrupt(time) => {}
+        error = service.recording_failed() => {
+            service.close().await;
+            anyhow::bail!("recording failed: {error}");
+        }
+    }
     let summary = end(&service).await.context("the recorder has stopped")??;
     service.close().await;
     if json {

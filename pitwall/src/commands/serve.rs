@@ -15,6 +15,7 @@ pub(super) async fn run(network: &NetworkOptions, page: Page, json: bool) -> any
     let options = PageOptions {
         address: page.address,
         recordings: page.recordings.clone(),
+        recorder: page.recorder.options(network.operator()),
     };
     let server = PitWallServer::start(PitWallOptions { role, page: options }).await?;
     #[cfg(feature = "rerun")]

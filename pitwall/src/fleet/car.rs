@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{
-    CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params, Pose,
-    ScanView, Shadow, State, Telemetry, Topic, Truth,
+    CarInfo, CarName, Cloud, Event, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params,
+    Pose, ScanView, Shadow, State, Telemetry, Topic, Truth,
 };
 
 use crate::analysis::{LapBook, MapCheck, PoseSample, TrackLine};
@@ -17,6 +17,10 @@ use super::stream_statistics::{Freshness, StreamStatistics};
 
 /// A car, as the pit wall knows it.
 #[derive(Debug, Clone)]
+#[expect(
+    clippy::struct_excessive_bools,
+    reason = "two are for the log, and each is a state of its own"
+)]
 pub struct Car {
     /// Its name.
     pub name: CarName,
@@ -52,6 +56,10 @@ pub struct Car {
     pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
     /// The software on it.
     pub info: Option<CarInfo>,
+    /// True where the full-rate streams are shown in place of the live ones, because they are complete.
+    complete: bool,
+    /// When the recording of each run begins, by the car's clock \[unix ns\]. Laps that ended before it are left out.
+    laps_since: BTreeMap<u64, i64>,
     laps: LapTimer,
     book: LapBook,
     map_check: Option<MapCheck>,
@@ -91,6 +99,8 @@ impl Car {
             truth: None,
             map: None,
             info: None,
+            complete: false,
+            laps_since: BTreeMap::new(),
             laps: LapTimer::default(),
             book: LapBook::default(),
             map_check: None,
@@ -115,8 +125,8 @@ impl Car {
             return false;
         }
         match telemetry {
-            // The full-rate pose is the same pose again, held back until gaps are filled: not for display.
-            Telemetry::Pose(_) | Telemetry::Health(_) if topic.recorded() => {}
+            // Live, the full-rate pose is the same pose again, held back until gaps are filled: not for display.
+            Telemetry::Pose(_) | Telemetry::Health(_) if !self.shows(topic) => {}
             Telemetry::Pose(pose) => {
                 self.pose = Some((*header, *pose));
                 if let Some(sample) = PoseSample::of(header, pose) {
@@ -130,6 +140,7 @@ impl Car {
                         at: header.sensor,
                         s: track.s,
                         d: track.d,
+                        position: [pose.pose.x, pose.pose.y],
                         lap: pose.lap,
                     };
                     self.laps.on_pose(here, length);
@@ -165,19 +176,35 @@ impl Car {
             Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
             Telemetry::Truth(truth) => self.truth = Some(*truth),
             Telemetry::Event(event) => {
-                self.book.on_event(event);
-                if let EventKind::Lap {
-                    lap,
-                    time: Some(time),
-                    set,
-                } = &event.kind
-                {
-                    self.laps.on_lap(*lap, *time, set);
+                let since = self.laps_since.get(&header.run_id);
+                let ended_before = matches!(event.kind, EventKind::Lap { .. })
+                    && since.is_some_and(|since| header.sensor < *since);
+                if !ended_before {
+                    self.book.on_event(event);
+                    self.on_event(event);
                 }
             }
             Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
         }
         true
+    }
+
+    fn on_event(&mut self, event: &Event) {
+        match &event.kind {
+            EventKind::Lap {
+                lap,
+                time: Some(time),
+                set,
+            } => self.laps.on_lap(*lap, *time, set),
+            EventKind::PoseInitialized { .. } => self.laps.make_void("a pose was given"),
+            EventKind::Relocalized { .. } => self.laps.make_void("the pose was searched for"),
+            _ => {}
+        }
+    }
+
+    /// True when the messages of a topic are shown: for poses and health, the live or the full-rate ones.
+    pub(crate) fn shows(&self, topic: Topic) -> bool {
+        topic.recorded() == self.complete
     }
 
     /// Sets the map that it localizes on, with its encoded bytes.
@@ -199,6 +226,11 @@ impl Car {
         self.map_check.as_ref()
     }
 
+    /// The best lap \[s\]. Void laps do not count.
+    pub fn best_lap(&self) -> Option<f64> {
+        LapTimer::best(self.laps())
+    }
+
     /// Laps driven, the last 500.
     pub fn laps(&self) -> &[Lap] {
         self.laps.laps()
@@ -213,6 +245,13 @@ impl Car {
     /// without a raceline.
     pub fn health_profile(&self) -> &[Option<ProfileCell>] {
         self.health_profile.cells()
+    }
+
+    /// Prepares a car for being read from a recording: `complete` where its full-rate streams are to be used, and when the
+    /// recording of each run begins, by the car's clock \[unix ns\].
+    pub(crate) fn read_from(&mut self, complete: bool, laps_since: BTreeMap<u64, i64>) {
+        self.complete = complete;
+        self.laps_since = laps_since;
     }
 
     /// Length of a lap \[m\]; None without a raceline.

@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::car::Car;
 use super::stream_statistics::StreamView;
 use crate::event::Rejection;
+use crate::recording::missing_content;
 
 /// A car, ready to be shown or written as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -45,6 +46,10 @@ pub struct CarView {
     pub clock_uncertainty_s: Option<f64>,
     /// Every stream by topic.
     pub streams: BTreeMap<&'static str, StreamView>,
+    /// Messages whose content was sent and has not arrived, see [`missing_content`].
+    pub missing: u64,
+    /// Share of the messages sent, of the streams that must be complete, that are here, in `[0, 1]`; None before the first.
+    pub coverage: Option<f64>,
     /// The last lap \[s\].
     pub last_lap_s: Option<f64>,
     /// The best lap \[s\].
@@ -93,7 +98,16 @@ impl Car {
         if self.two_senders(now) {
             causes.insert(0, Rejection::TwoSenders.to_string());
         }
-        let best = self.laps().iter().map(|lap| lap.time_s).min_by(f64::total_cmp);
+        let best = self.best_lap();
+        let streams = self.streams.iter().map(|(topic, stream)| {
+            let gaps = stream.gaps();
+            (*topic, gaps.received(), gaps.missing())
+        });
+        let missing = missing_content(streams.clone());
+        let sent: u64 = streams
+            .filter(|(topic, ..)| topic.recovered())
+            .map(|(_, received, missing)| received.saturating_add(missing))
+            .fold(0, u64::saturating_add);
         CarView {
             car: self.name.clone(),
             state,
@@ -139,6 +153,8 @@ impl Car {
                 .iter()
                 .map(|(topic, stream)| (topic.as_str(), stream.view(now, offset)))
                 .collect(),
+            missing,
+            coverage: (sent > 0).then(|| 1.0 - (missing as f64 / sent as f64).min(1.0)),
             last_lap_s: self.laps().last().map(|lap| lap.time_s),
             best_lap_s: best,
             info: self.info.clone(),

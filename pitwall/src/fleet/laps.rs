@@ -18,6 +18,8 @@ pub struct Lap {
     pub lap: u32,
     /// Its time \[s\].
     pub time_s: f64,
+    /// Why the time does not count; None for a good lap.
+    pub void: Option<&'static str>,
     /// The set in force at its end.
     pub set: String,
     /// Sector times \[s\]; None if poses are missing.
@@ -62,6 +64,8 @@ pub(crate) struct TrackPose {
     pub(crate) s: f64,
     /// Distance from the raceline \[m\].
     pub(crate) d: f64,
+    /// Position in the map \[m\].
+    pub(crate) position: [f64; 2],
     /// Laps begun.
     pub(crate) lap: u32,
 }
@@ -70,6 +74,7 @@ pub(crate) struct TrackPose {
 #[derive(Debug, Clone, Default)]
 struct Trace {
     lap: u32,
+    void: Option<&'static str>,
     /// When it started \[unix ns\]; None if the start was missed.
     begun: Option<i64>,
     /// When each border between two sectors was passed \[unix ns\].
@@ -89,6 +94,10 @@ impl LapTimer {
     const MAX_TRACES: usize = 4;
     /// A longer time between two poses is a gap \[ns\].
     const GAP: i64 = 1_000_000_000;
+    /// Two poses that are further apart than this speed allows are a jump \[m/s\]. No car of this class is that fast.
+    const FASTEST: f64 = 25.0;
+    /// How far a pose may move beyond that \[m\].
+    const LOOSE: f64 = 0.5;
 
     pub(crate) fn laps(&self) -> &[Lap] {
         &self.laps
@@ -97,6 +106,7 @@ impl LapTimer {
     /// Adds a pose on a raceline of `length` \[m\].
     pub(crate) fn on_pose(&mut self, here: TrackPose, length: f64) {
         let before = self.last.replace(here);
+        let jumped = before.is_some_and(|before| before.jumps_to(here));
         // A car that restarts counts its laps from the beginning.
         if self.traces.back().is_some_and(|trace| trace.lap > here.lap) {
             self.traces.clear();
@@ -117,6 +127,9 @@ impl LapTimer {
         let Some(trace) = self.traces.back_mut() else {
             return;
         };
+        if jumped {
+            trace.void = Some("the pose has jumped");
+        }
         trace.poses += 1;
         trace.lateral += here.d.abs();
         if let Some(step) = step {
@@ -129,6 +142,19 @@ impl LapTimer {
                 }
             }
         }
+    }
+
+    /// Makes the present lap void: its time does not count.
+    pub(crate) fn make_void(&mut self, why: &'static str) {
+        if let Some(trace) = self.traces.back_mut() {
+            trace.void = Some(why);
+        }
+    }
+
+    /// The best lap \[s\]. Void laps do not count.
+    pub(crate) fn best(laps: &[Lap]) -> Option<f64> {
+        let good = laps.iter().filter(|lap| lap.void.is_none());
+        good.map(|lap| lap.time_s).min_by(f64::total_cmp)
     }
 
     /// Takes in what was measured just now.
@@ -170,6 +196,7 @@ impl LapTimer {
         self.laps.push(Lap {
             lap,
             time_s,
+            void: trace.and_then(|trace| trace.void),
             set: set.to_owned(),
             sectors_s,
             grip: trace.and_then(Trace::grip),
@@ -177,6 +204,14 @@ impl LapTimer {
                 .filter(|trace| trace.poses > 0)
                 .map(|trace| trace.lateral / f64::from(trace.poses)),
         });
+    }
+}
+
+impl TrackPose {
+    fn jumps_to(self, here: Self) -> bool {
+        let seconds = (here.at - self.at).max(0) as f64 * 1e-9;
+        let [dx, dy] = [0, 1].map(|i| here.position[i] - self.position[i]);
+        dx.hypot(dy) > LapTimer::FASTEST * seconds + LapTimer::LOOSE
     }
 }
 
@@ -234,7 +269,7 @@ mod tests {
     fn drive(timer: &mut LapTimer, laps: u32) {
         let (mut s, mut at, mut lap) = (29.0, 0, 0);
         while lap < laps + 1 {
-            timer.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
+            timer.on_pose(on_ring(at, s, lap), LENGTH);
             let speed = [5.0, 10.0, 2.5][(s / 10.0) as usize % SECTORS];
             s += speed / 40.0;
             at += 25_000_000;
@@ -243,7 +278,7 @@ mod tests {
                 lap += 1;
             }
         }
-        timer.on_pose(TrackPose { at, s, d: -0.1, lap }, LENGTH);
+        timer.on_pose(on_ring(at, s, lap), LENGTH);
     }
 
     #[test]
@@ -272,14 +307,42 @@ mod tests {
         assert!(timer.laps()[0].sectors_s.iter().all(Option::is_some));
     }
 
-    /// In the first lap, on the line.
-    fn passed(at: i64, s: f64) -> TrackPose {
+    /// A ring of this length.
+    fn on_ring(at: i64, s: f64, lap: u32) -> TrackPose {
+        let (sin, cos) = (s / LENGTH * std::f64::consts::TAU).sin_cos();
+        let radius = LENGTH / std::f64::consts::TAU;
         TrackPose {
             at,
             s,
-            d: 0.0,
-            lap: 1,
+            d: -0.1,
+            position: [radius * cos, radius * sin],
+            lap,
         }
+    }
+
+    /// In the first lap.
+    fn passed(at: i64, s: f64) -> TrackPose {
+        on_ring(at, s, 1)
+    }
+
+    // A pose that was given in the middle of a lap once made a lap of 3.527 s, the best of the day.
+    #[test]
+    fn a_lap_with_a_jump_or_a_given_pose_is_void_and_never_the_best() {
+        let mut timer = LapTimer::default();
+        drive(&mut timer, 1);
+        timer.on_lap(1, 7.0, "hq");
+        timer.on_pose(on_ring(20_000_000_000, 15.0, 2), LENGTH);
+        timer.on_pose(on_ring(20_025_000_000, 25.0, 2), LENGTH);
+        timer.on_lap(2, 3.5, "hq");
+        timer.on_pose(on_ring(20_050_000_000, 25.1, 3), LENGTH);
+        timer.make_void("a pose was given");
+        timer.on_lap(3, 3.0, "hq");
+        let void: Vec<_> = timer.laps().iter().map(|lap| lap.void).collect();
+        assert_eq!(
+            void,
+            [None, Some("the pose has jumped"), Some("a pose was given")]
+        );
+        assert_eq!(LapTimer::best(timer.laps()), Some(7.0));
     }
 
     #[test]

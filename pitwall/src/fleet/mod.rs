@@ -30,6 +30,8 @@ pub use stream_statistics::{StreamStatistics, StreamView};
 #[derive(Debug, Clone, Default)]
 pub struct Fleet {
     cars: BTreeMap<CarName, Car>,
+    /// Cars of a recording that may come, see [`Car::read_from`].
+    expected: BTreeMap<CarName, (bool, BTreeMap<u64, i64>)>,
     log: Log,
 }
 
@@ -42,10 +44,13 @@ impl Fleet {
             payload,
         } = event;
         let at = *at;
-        let car = self
-            .cars
-            .entry(name.clone())
-            .or_insert_with(|| Car::new(name.clone(), at));
+        let car = self.cars.entry(name.clone()).or_insert_with(|| {
+            let mut car = Car::new(name.clone(), at);
+            if let Some((complete, laps_since)) = self.expected.get(name) {
+                car.read_from(*complete, laps_since.clone());
+            }
+            car
+        });
         match payload {
             EventPayload::Appeared => {
                 car.alive = true;
@@ -119,6 +124,33 @@ impl Fleet {
         let names: Vec<_> = self.cars.keys().cloned().collect();
         for name in names {
             self.update_link(&name, now);
+        }
+    }
+
+    /// Prepares a car that is about to be read from a recording, see [`Car::read_from`].
+    pub(crate) fn read_from(&mut self, name: CarName, complete: bool, laps_since: BTreeMap<u64, i64>) {
+        self.expected.insert(name, (complete, laps_since));
+    }
+
+    /// Forgets what arrived of the full-rate streams, because nobody has listened to them since.
+    pub(crate) fn forget_recorded(&mut self) {
+        for car in self.cars.values_mut() {
+            car.streams.retain(|topic, _| !topic.recorded());
+        }
+    }
+
+    /// Lets time pass from `since` until `until` \[unix ns\] in steps. A long pause takes a few steps, too.
+    pub(crate) fn tick_between(&mut self, since: &mut i64, until: i64) {
+        const TICK: i64 = 100_000_000;
+        const LONG: i64 = 60_000_000_000;
+        if until.saturating_sub(*since) > LONG {
+            // Everything that happens in silence has happened after a minute.
+            self.tick(since.saturating_add(LONG / 2));
+            *since = until.saturating_sub(TICK);
+        }
+        while since.saturating_add(TICK) < until {
+            *since += TICK;
+            self.tick(*since);
         }
     }
 

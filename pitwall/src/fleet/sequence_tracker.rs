@@ -103,6 +103,13 @@ impl SequenceTracker {
         }
     }
 
+    /// The missing numbers, with their runs.
+    pub fn missing_by_run(&self) -> impl Iterator<Item = (u64, [u64; 2])> {
+        self.runs
+            .iter()
+            .flat_map(|run| run.missing.iter().map(|range| (run.run_id, range)))
+    }
+
     /// True when a message of this run has arrived.
     pub fn has_run(&self, run_id: u64) -> bool {
         self.runs.iter().any(|run| run.run_id == run_id)

@@ -12,6 +12,7 @@ use protocol::{
 use tokio::sync::mpsc;
 use zenoh::qos::Priority;
 
+use super::marker;
 use super::query::{CONGESTION, OPERATOR_PRIORITY, first_reply, query, stamps};
 use super::verdict::Verdict;
 use crate::clock::unix_now;
@@ -235,6 +236,17 @@ impl Client {
             .await
         {
             tracing::debug!(%key, %error, "the link report could not be sent");
+        }
+    }
+
+    /// Sends a marker to every pit wall on the network, this one included.
+    pub(crate) async fn mark(&self, car: &CarName, who: &str, text: &str) {
+        let key = marker::key(car);
+        let sent = self.session.put(&key, marker::encode(who, text)).await;
+        if let Err(error) = sent {
+            tracing::warn!(%key, %error, "the marker is in this pit wall's log only");
+            let (who, text) = (who.into(), text.into());
+            self.emit(car, EventPayload::Marker { who, text });
         }
     }
 

@@ -18,6 +18,7 @@ use super::client::Client;
 use super::decoder::{Decoder, DecoderInput, send_missing_queries};
 use super::error::ConnectionError;
 use super::gap_recovery::Outstanding;
+use super::marker;
 use super::role::Role;
 use crate::clock::unix_now;
 use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
@@ -78,6 +79,7 @@ impl Connection {
             };
             live.push(Box::new(subscribe(&session, topic, delivery, &inputs).await?));
         }
+        live.push(Box::new(watch_markers(&session, &sink).await?));
         Ok(Self {
             client: Client::new(session.clone(), sink),
             session,
@@ -133,6 +135,25 @@ impl Connection {
             tracing::warn!("the network did not confirm that the connection is closed");
         }
     }
+}
+
+/// Receives the markers of all pit walls.
+async fn watch_markers(
+    session: &zenoh::Session,
+    sink: &EventSink,
+) -> Result<impl Send + Sync + use<>, ConnectionError> {
+    let sink = sink.clone();
+    session
+        .declare_subscriber(marker::OF_ALL_CARS)
+        .callback(move |sample: Sample| {
+            let bytes = sample.payload().to_bytes();
+            if let Some((car, payload)) = marker::decode(sample.key_expr().as_str(), &bytes) {
+                let at = unix_now();
+                sink(FleetEvent { at, car, payload });
+            }
+        })
+        .await
+        .map_err(|e| ConnectionError::subscribe(marker::OF_ALL_CARS, &e))
 }
 
 /// Watches the liveliness tokens of the cars' runs.

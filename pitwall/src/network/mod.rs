@@ -16,6 +16,7 @@ mod connection;
 mod decoder;
 mod error;
 pub(crate) mod gap_recovery;
+mod marker;
 mod query;
 mod reorder_buffer;
 mod role;

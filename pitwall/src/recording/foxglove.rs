@@ -217,8 +217,25 @@ fn stamped(time: &Value, message: &impl serde::Serialize) -> Value {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
+    use protocol::{Covariance, PoseKind, Twist2};
+
+    pub(in super::super) fn pose() -> Pose {
+        Pose {
+            pose: Pose2::default(),
+            twist: Twist2 {
+                linear_x: 1.0,
+                linear_y: 0.0,
+                angular: 0.0,
+            },
+            covariance: Covariance::default(),
+            track: None,
+            lap: 0,
+            update: 1,
+            kind: PoseKind::Updated,
+        }
+    }
 
     #[test]
     fn a_schema_describes_its_message() {

@@ -17,29 +17,37 @@
 //! | `/<car>/{state,health,load,params}` | json | our own |
 //!
 //! The log time is the arrival by the laptop's clock, the publish time is the car's.
+mod check;
 mod error;
 pub(crate) mod fetch;
 mod foxglove;
 mod merge;
 mod note;
+mod ordered;
 mod reader;
 mod recorder;
 mod recover;
 mod salvage;
+mod session;
 mod session_index;
 mod summary;
+mod survey;
 mod unreadable;
 mod writer;
 
 /// What the car's program calls itself at the start of its files.
 const CAR_LIBRARY: &str = "car-node";
 
+pub use check::{CarCheck, Check, GapCheck, StreamCheck, check};
 pub use error::RecordingError;
 pub use fetch::{FetchError, FetchOptions, FetchProgress, Fetched, FileSource, fetch};
 pub use merge::{Merged, MergedInput, merge};
+pub use ordered::{InOrder, read_in_order};
 pub use reader::{Recording, read_events};
-pub use recorder::{Recorder, RecorderStatus, RecordingProgress};
+pub use recorder::{Recorder, RecorderOptions, RecorderStatus, RecordingProgress};
 pub use recover::{Damage, Recovered, recover};
+pub use session::session_name;
 pub use session_index::{Session, SessionIndex, SessionIndexError};
-pub use summary::{RecordingSummary, StreamSummary};
+pub use summary::{RecordingSummary, StreamSummary, missing_content};
+pub(crate) use survey::{Survey, survey};
 pub use unreadable::{Unreadable, UnreadableCount};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use protocol::{CarInfo, CarName, Header, Topic};
 use serde::{Deserialize, Serialize};
 
-use crate::event::{EventPayload, Rejection};
+use crate::event::{EventPayload, Rejection, SentRange};
 
 /// An event that is not a message.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,6 +26,12 @@ pub(super) enum Note {
         sequence: u64,
         count: u64,
         reason: Rejection,
+    },
+    /// The car answered the final sync.
+    StreamEnds {
+        run_id: u64,
+        published: i64,
+        outstanding: Vec<SentRange>,
     },
     Info {
         info: CarInfo,
@@ -90,9 +96,16 @@ impl Note {
                 who: who.to_string(),
                 text: text.to_string(),
             },
-            EventPayload::Message { .. } | EventPayload::Map { .. } | EventPayload::StreamEnds { .. } => {
-                return None;
-            }
+            EventPayload::StreamEnds {
+                run_id,
+                published,
+                outstanding,
+            } => Self::StreamEnds {
+                run_id: *run_id,
+                published: *published,
+                outstanding: outstanding.clone(),
+            },
+            EventPayload::Message { .. } | EventPayload::Map { .. } => return None,
         })
     }
 }
@@ -115,6 +128,15 @@ impl From<Note> for EventPayload {
                 sequence,
                 count,
                 reason,
+            },
+            Note::StreamEnds {
+                run_id,
+                published,
+                outstanding,
+            } => Self::StreamEnds {
+                run_id,
+                published,
+                outstanding,
             },
             Note::Info { info } => Self::Info(info),
             Note::Clock { offset, round_trip } => Self::Clock { offset, round_trip },

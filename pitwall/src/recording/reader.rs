@@ -33,7 +33,25 @@ pub struct Recording {
     complete: bool,
     /// Damaged places are passed over, and noted here; None: they are errors.
     passed_over: Option<Vec<String>>,
+    /// The topics of the messages that are read.
+    wanted: fn(Topic) -> bool,
 }
+
+/// A message or a note, not decoded.
+#[derive(Debug)]
+pub(super) enum RawEvent {
+    Message {
+        topic: Topic,
+        /// None where it is damaged.
+        header: Option<Header>,
+        /// Length.
+        bytes: usize,
+    },
+    Note(Note),
+}
+
+/// What a message on a channel is: its content and its car. None for one that is not wanted.
+type Decoded<P> = Result<Option<(P, CarName)>, String>;
 
 #[derive(PartialEq)]
 enum Progress {
@@ -57,6 +75,7 @@ pub fn read_events(path: &Path) -> Result<Recording, RecordingError> {
         library: String::new(),
         complete: false,
         passed_over: None,
+        wanted: |_| true,
     })
 }
 
@@ -65,6 +84,31 @@ pub(super) fn read_intact(path: &Path) -> Result<Recording, RecordingError> {
     let mut recording = read_events(path)?;
     recording.passed_over = Some(Vec::new());
     Ok(recording)
+}
+
+/// Reads the headers of a recording's messages, and its notes: time of arrival \[unix ns\], car, content.
+pub(super) fn read_raw(
+    path: &Path,
+) -> Result<impl Iterator<Item = Result<(i64, CarName, RawEvent), RecordingError>>, RecordingError> {
+    let mut recording = read_events(path)?;
+    Ok(std::iter::from_fn(move || {
+        let next = recording
+            .next_with(|channel, encoding, data, _| {
+                if encoding == WIRE_ENCODING {
+                    let key = channel.parse::<Key>().map_err(|e| e.to_string())?;
+                    let header = Header::read(data).ok();
+                    let (topic, bytes) = (key.topic, data.len());
+                    let carries = Telemetry::carried_by(topic);
+                    return Ok(carries.then_some((RawEvent::Message { topic, header, bytes }, key.car)));
+                }
+                note(channel, data).map(|note| note.map(|(note, car)| (RawEvent::Note(note), car)))
+            })
+            .transpose();
+        if !matches!(next, Some(Ok(_))) {
+            recording.progress = Progress::Done;
+        }
+        next
+    }))
 }
 
 /// Opens a file that begins as an MCAP file does.
@@ -109,8 +153,28 @@ impl Recording {
         self.passed_over.as_deref().unwrap_or_default()
     }
 
+    /// Leaves out the messages of the topics that are not wanted. They are not decoded.
+    pub(super) fn only(mut self, wanted: fn(Topic) -> bool) -> Self {
+        self.wanted = wanted;
+        self
+    }
+
     /// The next event; None at the end of a complete recording.
     fn next_event(&mut self) -> Result<Option<FleetEvent>, RecordingError> {
+        let next = self.next_with(|channel, encoding, data, wanted| {
+            if encoding == WIRE_ENCODING {
+                return wire_message(channel, data, wanted);
+            }
+            note(channel, data).map(|note| note.map(|(note, car)| (note.into(), car)))
+        })?;
+        Ok(next.map(|(at, car, payload)| FleetEvent { at, car, payload }))
+    }
+
+    /// The next message that `decode` makes something of.
+    fn next_with<P>(
+        &mut self,
+        decode: impl Fn(&str, &str, &[u8], fn(Topic) -> bool) -> Decoded<P>,
+    ) -> Result<Option<(i64, CarName, P)>, RecordingError> {
         while self.progress != Progress::Done {
             let Some(record) = self.next_record()? else {
                 return Ok(None);
@@ -120,8 +184,8 @@ impl Recording {
                     self.channels.insert(channel.id, channel);
                 }
                 Salvaged::Message(header, data) => {
-                    if let Some(event) = self.event(&header, &data)? {
-                        return Ok(Some(event));
+                    if let Some((payload, car)) = self.decoded(&header, &data, &decode)? {
+                        return Ok(Some((header.log_time as i64, car, payload)));
                     }
                 }
                 Salvaged::DataEnd => self.progress = Progress::Summary,
@@ -155,8 +219,13 @@ impl Recording {
         }
     }
 
-    /// The event that a message holds; None for one that is for other programs.
-    fn event(&mut self, header: &MessageHeader, data: &[u8]) -> Result<Option<FleetEvent>, RecordingError> {
+    /// What a message holds; None for one that is not wanted, and for one for other programs.
+    fn decoded<P>(
+        &mut self,
+        header: &MessageHeader,
+        data: &[u8],
+        decode: impl Fn(&str, &str, &[u8], fn(Topic) -> bool) -> Decoded<P>,
+    ) -> Result<Option<(P, CarName)>, RecordingError> {
         let Some(channel) = self.channels.get(&header.channel_id) else {
             let reason = format!("a message is on the unknown channel {}", header.channel_id);
             if let Some(passed_over) = &mut self.passed_over {
@@ -168,20 +237,8 @@ impl Recording {
             }
             return Err(RecordingError::broken(&self.path, reason));
         };
-        let decoded = if channel.message_encoding == WIRE_ENCODING {
-            wire_message(&channel.topic, data)
-        } else if let Some(car) = Note::car(&channel.topic) {
-            let note = serde_json::from_slice::<Note>(data);
-            note.map(|note| (note.into(), car)).map_err(|e| e.to_string())
-        } else {
-            return Ok(None);
-        };
-        match decoded {
-            Ok((payload, car)) => Ok(Some(FleetEvent {
-                at: header.log_time as i64,
-                car,
-                payload,
-            })),
+        match decode(&channel.topic, &channel.message_encoding, data, self.wanted) {
+            Ok(decoded) => Ok(decoded),
             Err(error) => {
                 let channel = channel.topic.as_str();
                 if self.skipped.insert(channel.to_owned()) {
@@ -193,13 +250,25 @@ impl Recording {
     }
 }
 
-fn wire_message(channel: &str, data: &[u8]) -> Result<(EventPayload, CarName), String> {
+/// The note on a channel; None on a channel for other programs.
+fn note(channel: &str, data: &[u8]) -> Decoded<Note> {
+    let Some(car) = Note::car(channel) else {
+        return Ok(None);
+    };
+    let note = serde_json::from_slice::<Note>(data).map_err(|e| e.to_string())?;
+    Ok(Some((note, car)))
+}
+
+fn wire_message(channel: &str, data: &[u8], wanted: fn(Topic) -> bool) -> Decoded<EventPayload> {
     let key = channel.parse::<Key>().map_err(|e| e.to_string())?;
-    Ok((payload(key.topic, data)?, key.car))
+    if !wanted(key.topic) {
+        return Ok(None);
+    }
+    Ok(Some((payload(key.topic, data)?, key.car)))
 }
 
 /// The payload of a message as it came. An error for a topic that is not recorded.
-fn payload(topic: Topic, data: &[u8]) -> Result<EventPayload, String> {
+pub(super) fn payload(topic: Topic, data: &[u8]) -> Result<EventPayload, String> {
     let bytes = || data.into();
     let payload = if topic == Topic::Map {
         decode::<MapReply>(data).map(|(_, map)| EventPayload::Map {

@@ -407,7 +407,7 @@ mod tests {
         let recovered = case.recover(&bytes).expect("saved");
         assert_eq!(case.numbers(), (0..100).collect::<Vec<_>>());
         assert!(!recovered.has_losses() && recovered.damage.is_empty() && recovered.complete);
-        assert_eq!((recovered.attachments, recovered.metadata), (1, 1));
+        assert_eq!((recovered.attachments, recovered.metadata), (1, 2));
         assert_eq!(recovered.lost, Some(0));
         let [before, after] = [&bytes, &fs::read(&case.to).expect("readable")].map(|bytes| {
             let summary = mcap::Summary::read(bytes).expect("whole").expect("a summary");
@@ -471,7 +471,7 @@ mod tests {
         let recovered = case.recover(&bytes).expect("saved");
         let numbers = case.numbers();
         assert_eq!(numbers, (0..30).chain(40..100).collect::<Vec<_>>());
-        assert_eq!((recovered.attachments, recovered.metadata), (1, 1));
+        assert_eq!((recovered.attachments, recovered.metadata), (1, 2));
         assert_eq!((recovered.lost, recovered.has_losses()), (Some(20), true));
         let [damage] = &recovered.damage[..] else {
             panic!("{recovered:?}");

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RecordingError;
 use super::reader::read_intact;
+use super::summary::missing_content;
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::{Fleet, SequenceTracker};
 
@@ -370,11 +371,16 @@ impl Content {
         session.started = from;
         session.duration_s = (to - from) as f64 * 1e-9;
         session.sets = self.sets.into_iter().collect();
-        session.missing = self.streams.values().map(SequenceTracker::missing).sum();
+        for car in self.fleet.cars() {
+            let streams = self.streams.iter().filter(|((name, _), _)| *name == car.name);
+            session.missing += missing_content(
+                streams.map(|((_, topic), numbers)| (*topic, numbers.received(), numbers.missing())),
+            );
+        }
         for car in self.fleet.cars().take(MAX_WORDS) {
             session.cars.push(car.name.clone());
             session.laps += car.laps().len();
-            for lap in car.laps() {
+            for lap in car.laps().iter().filter(|lap| lap.void.is_none()) {
                 if session
                     .best_lap
                     .as_ref()

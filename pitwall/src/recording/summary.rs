@@ -5,6 +5,7 @@ use std::fmt;
 use protocol::{CarName, Topic};
 use serde::Serialize;
 
+use super::survey::full_rate;
 use crate::fleet::GapSummary;
 
 /// The content of a recording, and what is missing in it.
@@ -37,10 +38,38 @@ pub struct StreamSummary {
     pub gaps: GapSummary,
 }
 
+/// Missing messages of one car, counted by content. Each item is a topic, how many arrived and how many are missing.
+///
+/// Live poses and health messages are copies of those at full rate: what is missing of them counts only where the full-rate
+/// stream is not there. Of clouds, scan views, load and sets only the newest matters, so that none of those is missing.
+pub fn missing_content(streams: impl Iterator<Item = (Topic, u64, u64)>) -> u64 {
+    let streams: Vec<_> = streams.collect();
+    let received = |topic| {
+        streams
+            .iter()
+            .find(|(other, ..)| *other == topic)
+            .map_or(0, |(_, received, _)| *received)
+    };
+    let counts = |topic: Topic, count: u64| match full_rate(topic) {
+        Some(full) => received(full) < count.max(1),
+        None => topic.recovered(),
+    };
+    streams
+        .iter()
+        .filter(|(topic, received, _)| counts(*topic, *received))
+        .fold(0, |sum, (_, _, missing)| sum.saturating_add(*missing))
+}
+
 impl RecordingSummary {
-    /// Messages that were sent and are not in the file.
+    /// Messages whose content was sent and is not in the file, see [`missing_content`].
     pub fn missing(&self) -> u64 {
-        self.streams.iter().map(|stream| stream.gaps.missing).sum()
+        let mut cars: Vec<_> = self.streams.iter().map(|stream| &stream.car).collect();
+        cars.dedup();
+        let missing = |car: &CarName| {
+            let streams = self.streams.iter().filter(|stream| stream.car == *car);
+            missing_content(streams.map(|stream| (stream.topic, stream.gaps.received, stream.gaps.missing)))
+        };
+        cars.into_iter().map(missing).sum()
     }
 }
 

@@ -1,14 +1,15 @@
 //! Writes one recording.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::{Seek, Write};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
-use protocol::{CarName, Key, Topic};
+use protocol::{CarName, Key, Telemetry, Topic};
 
 use super::foxglove::{self, Exported};
 use super::note::Note;
+use super::session::Session;
 use super::summary::{RecordingSummary, StreamSummary};
 use crate::event::{EventPayload, FleetEvent, SentRange};
 use crate::fleet::{SequenceStatus, SequenceTracker};
@@ -36,11 +37,16 @@ type End = PublishTime;
 /// A recording being written.
 pub(super) struct RecordingWriter<W: Write + Seek> {
     writer: Writer<W>,
+    session: Session,
     channels: HashMap<String, u16>,
     schemas: HashMap<&'static str, u16>,
     streams: BTreeMap<Key, RecordedStream>,
     /// The end of each car that has answered the final sync.
     ends: BTreeMap<CarName, End>,
+    /// What the JSON channels of each car have.
+    exported: BTreeMap<CarName, ExportedTimes>,
+    /// Each car's clock minus the laptop's \[ns\].
+    offsets: BTreeMap<CarName, i64>,
     notes: u32,
     messages: u64,
     first: Option<i64>,
@@ -49,15 +55,15 @@ pub(super) struct RecordingWriter<W: Write + Seek> {
 
 impl<W: Write + Seek> RecordingWriter<W> {
     pub(super) fn new(writer: W) -> Result<Self, mcap::McapError> {
-        let options = WriteOptions::new()
-            .profile("")
-            .library(concat!("pitwall ", env!("CARGO_PKG_VERSION")));
         Ok(Self {
-            writer: options.create(writer)?,
+            writer: begin(writer)?,
+            session: Session::default(),
             channels: HashMap::new(),
             schemas: HashMap::new(),
             streams: BTreeMap::new(),
             ends: BTreeMap::new(),
+            exported: BTreeMap::new(),
+            offsets: BTreeMap::new(),
             notes: 0,
             messages: 0,
             first: None,
@@ -65,20 +71,39 @@ impl<W: Write + Seek> RecordingWriter<W> {
         })
     }
 
+    /// Goes on in another file. The counts of the streams go on, too. Returns the old file, which is not completed.
+    pub(super) fn continue_in(&mut self, writer: W) -> Result<Writer<W>, mcap::McapError> {
+        let old = std::mem::replace(&mut self.writer, begin(writer)?);
+        self.channels.clear();
+        self.schemas.clear();
+        self.exported.clear();
+        self.session.begin_file();
+        Ok(old)
+    }
+
+    /// Writes the metadata about the session.
+    pub(super) fn describe(&mut self, started: i64, operator: &str) -> Result<(), mcap::McapError> {
+        self.writer.write_metadata(&Session::first(started, operator))
+    }
+
     /// Writes an event, but not a duplicate and not a message from after the end.
     pub(super) fn write(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
-        let FleetEvent { at, car, payload } = event;
+        if self.admits(event) {
+            self.store(event)?;
+            self.first.get_or_insert(event.at);
+            self.last = self.last.max(Some(event.at));
+            self.messages += 1;
+        }
+        Ok(())
+    }
+
+    /// Counts an event. False for a duplicate, and for a message from after the end.
+    fn admits(&mut self, event: &FleetEvent) -> bool {
+        let FleetEvent { car, payload, .. } = event;
         match payload {
-            EventPayload::Message {
-                topic,
-                header,
-                telemetry,
-                bytes,
-                ..
-            } => {
+            EventPayload::Message { topic, header, .. } => {
                 let published = (header.run_id, header.published);
                 let key = Key::new(car.clone(), *topic);
-                let name = key.to_string();
                 let stream = self.streams.entry(key).or_default();
                 let beyond_the_end = self.ends.get(car).is_some_and(|&(run_id, end)| {
                     if header.run_id == run_id {
@@ -87,37 +112,14 @@ impl<W: Write + Seek> RecordingWriter<W> {
                         !stream.gaps.has_run(header.run_id)
                     }
                 });
-                if beyond_the_end {
-                    return Ok(());
-                }
-                if stream.gaps.arrive(header.run_id, header.sequence) == SequenceStatus::Duplicate {
-                    return Ok(());
+                if beyond_the_end
+                    || stream.gaps.arrive(header.run_id, header.sequence) == SequenceStatus::Duplicate
+                {
+                    return false;
                 }
                 if stream.until.0 != published.0 || stream.until.1 < published.1 {
                     stream.until = published;
                 }
-                let times = Times {
-                    arrived: *at,
-                    published: header.published,
-                    sequence: header.sequence as u32,
-                };
-                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
-                // The full-rate streams would repeat the live ones.
-                if !topic.recorded() || *topic == Topic::RecordedTruth {
-                    for exported in foxglove::export(car, header, telemetry) {
-                        self.write_json(car, &exported, times)?;
-                    }
-                }
-            }
-            EventPayload::Map { map, bytes } => {
-                let name = Key::new(car.clone(), Topic::Map).to_string();
-                let times = Times {
-                    arrived: *at,
-                    published: *at,
-                    sequence: 0,
-                };
-                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
-                self.write_json(car, &foxglove::export_map(map, *at), times)?;
             }
             EventPayload::StreamEnds {
                 run_id,
@@ -129,28 +131,84 @@ impl<W: Write + Seek> RecordingWriter<W> {
                     let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
                     stream.gaps.sent(*run_id, *from, *to);
                 }
-                return Ok(());
+            }
+            EventPayload::Rejected { topic, count, .. } => {
+                let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
+                stream.rejected = stream.rejected.saturating_add(*count);
+            }
+            _ => {}
+        }
+        true
+    }
+
+    /// Writes an event that has been counted.
+    pub(super) fn store(&mut self, event: &FleetEvent) -> Result<(), mcap::McapError> {
+        let FleetEvent { at, car, payload } = event;
+        match payload {
+            EventPayload::Message {
+                topic,
+                header,
+                telemetry,
+                bytes,
+                ..
+            } => {
+                self.session.on_run(car, header.run_id);
+                if let Telemetry::Params(params) = &**telemetry
+                    && let Some(metadata) = self.session.on_set(car, params)
+                {
+                    self.writer.write_metadata(&metadata)?;
+                }
+                let name = Key::new(car.clone(), *topic).to_string();
+                let times = Times {
+                    arrived: *at,
+                    published: header.published,
+                    sequence: header.sequence as u32,
+                };
+                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
+                // The full-rate streams fill in what is lost of the live ones.
+                let is_new = match self.exported.get_mut(car) {
+                    Some(exported) => exported.add(*topic, header.sensor),
+                    None => self
+                        .exported
+                        .entry(car.clone())
+                        .or_default()
+                        .add(*topic, header.sensor),
+                };
+                if is_new {
+                    // Other tools go by the log time: for them it is when a message would have arrived on a good link.
+                    let offset = self.offsets.get(car);
+                    let arrived =
+                        offset.map_or(*at, |offset| header.published.saturating_sub(*offset).min(*at));
+                    for exported in foxglove::export(car, header, telemetry) {
+                        self.write_json(car, &exported, Times { arrived, ..times })?;
+                    }
+                }
+            }
+            EventPayload::Map { map, bytes } => {
+                for file in self.session.on_map(map, *at) {
+                    self.writer.attach(&file)?;
+                }
+                let name = Key::new(car.clone(), Topic::Map).to_string();
+                let times = Times {
+                    arrived: *at,
+                    published: *at,
+                    sequence: 0,
+                };
+                self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
+                self.write_json(car, &foxglove::export_map(map, *at), times)?;
             }
             other => {
-                if let EventPayload::Rejected { topic, count, .. } = other {
-                    let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
-                    stream.rejected = stream.rejected.saturating_add(*count);
+                match other {
+                    EventPayload::Clock { offset, round_trip } => {
+                        self.offsets.insert(car.clone(), *offset);
+                        self.session.on_clock(car, *offset, *round_trip);
+                    }
+                    EventPayload::Info(info) => self.session.on_info(car, info),
+                    _ => {}
                 }
-                if let Some(note) = Note::of(other) {
-                    self.notes += 1;
-                    let times = Times {
-                        arrived: *at,
-                        published: *at,
-                        sequence: self.notes,
-                    };
-                    let json = serde_json::to_vec(&note).map_err(|e| mcap::McapError::Io(e.into()))?;
-                    self.write_to(&Note::channel(car), "json", 0, times, &json)?;
-                }
+                self.write_note(car, other, *at)?;
             }
         }
-        self.first.get_or_insert(*at);
-        self.last = self.last.max(Some(*at));
-        self.messages += 1;
         Ok(())
     }
 
@@ -207,24 +265,32 @@ impl<W: Write + Seek> RecordingWriter<W> {
     /// Writes the summary and the index, and completes the file.
     pub(super) fn finish(mut self) -> Result<(RecordingSummary, W), mcap::McapError> {
         let mut summary = self.summary();
-        let mut cars: Vec<_> = self.streams.into_keys().map(|key| key.car).collect();
+        let mut cars: Vec<_> = self.streams.keys().map(|key| key.car.clone()).collect();
         cars.dedup();
         cars.retain(|car| !self.ends.contains_key(car));
         summary.unanswered = cars;
-        let metadata = summary
-            .streams
-            .iter()
-            .map(|stream| {
-                let key = Key::new(stream.car.clone(), stream.topic).to_string();
-                (key, serde_json::to_string(&stream.gaps).unwrap_or_default())
-            })
-            .collect();
-        self.writer.write_metadata(&Metadata {
-            name: SUMMARY_RECORD.to_owned(),
-            metadata,
-        })?;
-        self.writer.finish()?;
+        complete(&mut self.writer, &summary, &self.session)?;
         Ok((summary, self.writer.into_inner()))
+    }
+
+    /// Completes a file that another one follows.
+    pub(super) fn complete_part(&self, mut part: Writer<W>) -> Result<W, mcap::McapError> {
+        complete(&mut part, &self.summary(), &self.session)?;
+        Ok(part.into_inner())
+    }
+
+    fn write_note(&mut self, car: &CarName, payload: &EventPayload, at: i64) -> Result<(), mcap::McapError> {
+        let Some(note) = Note::of(payload) else {
+            return Ok(());
+        };
+        self.notes += 1;
+        let times = Times {
+            arrived: at,
+            published: at,
+            sequence: self.notes,
+        };
+        let json = serde_json::to_vec(&note).map_err(|e| mcap::McapError::Io(e.into()))?;
+        self.write_to(&Note::channel(car), "json", 0, times, &json)
     }
 
     fn write_json(
@@ -278,6 +344,68 @@ impl<W: Write + Seek> RecordingWriter<W> {
         };
         self.writer.write_to_known_channel(&header, data)
     }
+}
+
+/// The sensor times of the poses and health messages that the JSON channels of a car have \[unix ns\].
+#[derive(Default)]
+struct ExportedTimes {
+    poses: BTreeSet<i64>,
+    healths: BTreeSet<i64>,
+}
+
+impl ExportedTimes {
+    /// Beyond this many, the oldest are forgotten: hours of poses, longer than a car keeps them.
+    const MOST: usize = 500_000;
+    /// Live health messages are this far apart, so that a hole is longer \[ns\].
+    const HEALTH: i64 = 150_000_000;
+
+    /// Adds a message. False when the channels have its content already, or should not have it.
+    fn add(&mut self, topic: Topic, sensor: i64) -> bool {
+        let (times, near) = match topic {
+            Topic::Pose | Topic::RecordedPose => (&mut self.poses, 0),
+            Topic::Health => (&mut self.healths, 0),
+            Topic::RecordedHealth => (&mut self.healths, Self::HEALTH),
+            topic => return !topic.recorded() || topic == Topic::RecordedTruth,
+        };
+        let around = sensor.saturating_sub(near)..=sensor.saturating_add(near);
+        if times.range(around).next().is_some() {
+            return false;
+        }
+        if times.len() == Self::MOST {
+            times.pop_first();
+        }
+        times.insert(sensor)
+    }
+}
+
+fn begin<W: Write + Seek>(writer: W) -> Result<Writer<W>, mcap::McapError> {
+    WriteOptions::new()
+        .profile("")
+        .library(concat!("pitwall ", env!("CARGO_PKG_VERSION")))
+        .create(writer)
+}
+
+/// Writes what is known at the end, and the index.
+fn complete<W: Write + Seek>(
+    writer: &mut Writer<W>,
+    summary: &RecordingSummary,
+    session: &Session,
+) -> Result<(), mcap::McapError> {
+    let metadata = summary
+        .streams
+        .iter()
+        .map(|stream| {
+            let key = Key::new(stream.car.clone(), stream.topic).to_string();
+            (key, serde_json::to_string(&stream.gaps).unwrap_or_default())
+        })
+        .collect();
+    writer.write_metadata(&session.last())?;
+    writer.write_metadata(&Metadata {
+        name: SUMMARY_RECORD.to_owned(),
+        metadata,
+    })?;
+    writer.finish()?;
+    Ok(())
 }
 
 #[derive(Clone, Copy)]

@@ -47,6 +47,10 @@ pub(super) fn of(car: &CarReport, duration_s: f64) -> Vec<Figure> {
             ages(car, duration_s),
         ),
         figure("Poses that arrived, second by second", poses(car, duration_s)),
+        figure(
+            "Share of the messages sent that are in the recording, over time",
+            coverage(car, duration_s),
+        ),
         figure("CPU of the node over time", load(car, duration_s)),
     ]
     .into_iter()
@@ -299,6 +303,13 @@ fn error(car: &CarReport) -> Option<(String, String)> {
         points.filter(|[_, e]| e.is_finite()),
     );
     Some(plot.finish())
+}
+
+fn coverage(car: &CarReport, duration_s: f64) -> Option<(String, String)> {
+    let shares = &car.series.coverage.0;
+    let mut plot = Plot::new([0.0, duration_s], [0.0, 1.02], ["time [s]", "share"]);
+    plot.line("main", "share", shares.iter().copied());
+    (shares.len() > 1).then(|| plot.finish())
 }
 
 fn load(car: &CarReport, duration_s: f64) -> Option<(String, String)> {

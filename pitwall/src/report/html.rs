@@ -222,7 +222,7 @@ fn laps(car: &CarReport) -> String {
     let least = |value: &dyn Fn(&crate::fleet::Lap) -> Option<f64>| {
         car.laps.iter().filter_map(value).min_by(f64::total_cmp)
     };
-    let best = least(&|lap| Some(lap.time_s));
+    let best = least(&|lap| lap.void.is_none().then_some(lap.time_s));
     let sectors: Vec<_> = (0..SECTORS)
         .map(|i| least(&move |lap| lap.sectors_s[i]))
         .collect();
@@ -255,7 +255,10 @@ fn laps(car: &CarReport) -> String {
         text.push_str(&format!(
             "<tr><td>{}</td>{}<td>+{:.3}</td>{cells}{}</tr>",
             lap.lap,
-            time(Some(lap.time_s), best),
+            match &lap.void {
+                Some(why) => format!("<td>{:.3} void: {why}</td>", lap.time_s),
+                None => time(Some(lap.time_s), best),
+            },
             lap.time_s - best.unwrap_or(lap.time_s),
             tds(&rest),
         ));

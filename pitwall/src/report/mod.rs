@@ -20,7 +20,7 @@ use crate::analysis::{AnalysisView, LapBook, LapData, LapKind, SessionLaps};
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
 use crate::fleet::Lap;
-use crate::recording::{RecordingError, Unreadable, UnreadableCount, read_events};
+use crate::recording::{InOrder, RecordingError, Survey, Unreadable, UnreadableCount, read_in_order};
 use timeline::Timeline;
 
 pub use timeline::Alarm;
@@ -127,6 +127,49 @@ struct Series {
     healths: Vec<HealthPoint>,
     loads: Vec<[f64; 3]>,
     truths: Vec<(i64, Pose2)>,
+    coverage: Coverage,
+}
+
+/// Share of what a car sent that is in the recording, over time.
+#[derive(Debug, Clone, Default)]
+struct Coverage(Vec<[f64; 2]>);
+
+impl Coverage {
+    /// Cells of the curve.
+    const CELLS: usize = 200;
+
+    /// The curve over the recording; empty where nothing can be missing.
+    fn of(survey: &Survey, car: &CarName) -> Self {
+        let (Some((from, to)), Some(offset)) = (survey.span, survey.offset(car)) else {
+            return Self::default();
+        };
+        let length = ((to - from) as f64 * 1e-9).max(1e-3);
+        let mut missing = vec![0.0; Self::CELLS];
+        let mut sent = vec![0.0; Self::CELLS];
+        let spread = |cells: &mut Vec<f64>, begin: i64, end: i64, count: f64| {
+            let place = |at: i64| {
+                let share = (at - offset - from) as f64 * 1e-9 / length;
+                ((share * Self::CELLS as f64).max(0.0) as usize).min(Self::CELLS - 1)
+            };
+            let (begin, end) = (place(begin), place(end.max(begin)));
+            for cell in &mut cells[begin..=end] {
+                *cell += count / (end - begin + 1) as f64;
+            }
+        };
+        for gap in survey.gaps(car) {
+            let (Some(begin), Some(end)) = (gap.from, gap.to) else {
+                continue;
+            };
+            spread(&mut missing, begin, end, gap.count as f64);
+            spread(&mut sent, begin, end, gap.count as f64);
+        }
+        for (begin, end, count) in survey.received(car) {
+            spread(&mut sent, begin, end, count as f64);
+        }
+        let cell = |i: usize| (i as f64 + 0.5) / Self::CELLS as f64 * length;
+        let shares = (0..Self::CELLS).filter(|i| sent[*i] > 0.0);
+        Self(shares.map(|i| [cell(i), 1.0 - missing[i] / sent[i]]).collect())
+    }
 }
 
 /// A pose.
@@ -169,11 +212,12 @@ impl Report {
 
     /// Reads a whole recording, and from others the laps to compare with.
     pub fn with(path: &Path, others: &[PathBuf]) -> Result<Self, RecordingError> {
-        let mut collector = Collector::default();
+        let events = read(path)?.with_copies();
+        let mut collector = Collector::new(events.survey());
         for other in others {
             collector.others.push(SessionLaps::of(other)?);
         }
-        for event in read_events(path)? {
+        for event in events {
             collector.add(&event?);
         }
         collector
@@ -194,6 +238,17 @@ impl CarReport {
     }
 }
 
+/// Reads the events that reports need, by the time of publishing.
+pub(crate) fn read(path: &Path) -> Result<InOrder, RecordingError> {
+    read_in_order(path, |topic| {
+        let large = matches!(
+            topic,
+            Topic::RecordedOdometry | Topic::RecordedScan | Topic::Cloud
+        );
+        !large
+    })
+}
+
 /// For each lap, why it does not count; None for one that does, or of which no more is known.
 fn kinds(laps: &[Lap], book: &LapBook) -> Vec<Option<&'static str>> {
     let traces: Vec<_> = book.laps().collect();
@@ -204,11 +259,14 @@ fn kinds(laps: &[Lap], book: &LapBook) -> Vec<Option<&'static str>> {
                 trace.lap == lap.lap && trace.time_s.is_some_and(|time| (time - lap.time_s).abs() < 1e-6)
             };
             // Laps and traces are in the same order.
-            let at = from + traces[from..].iter().position(same)?;
+            let Some(at) = traces[from..].iter().position(same) else {
+                return lap.void;
+            };
+            let at = from + at;
             from = at + 1;
             match traces[at].kind {
                 LapKind::Invalid(reason) => Some(reason.words()),
-                _ => None,
+                _ => lap.void,
             }
         })
         .collect()
@@ -225,19 +283,35 @@ struct Collector {
     span: Option<(i64, i64)>,
     ticked: i64,
     series: BTreeMap<CarName, Series>,
-    full_rate: BTreeMap<CarName, Vec<PosePoint>>,
+    missing: BTreeMap<CarName, u64>,
+    coverage: BTreeMap<CarName, Coverage>,
     unreadable: UnreadableCount,
 }
 
 impl Collector {
+    fn new(survey: &Survey) -> Self {
+        let mut collector = Self::default();
+        for car in &survey.cars() {
+            survey.prepare(&mut collector.fleet, car);
+            collector.missing.insert(car.clone(), survey.missing_content(car));
+            collector.coverage.insert(car.clone(), Coverage::of(survey, car));
+        }
+        collector
+    }
+
     fn add(&mut self, event: &FleetEvent) {
         const TICK: i64 = 100_000_000;
+        const LONG: i64 = 600_000_000_000;
         let (from, _) = *self.span.get_or_insert((event.at, event.at));
         self.span = Some((from, event.at.max(from)));
         // Time passes as it did, so that BLIND cars are noticed.
         self.ticked = self.ticked.max(from);
         while self.ticked + TICK < event.at {
             self.ticked += TICK;
+            if event.at - self.ticked > LONG {
+                // Everything that happens in silence has happened by then.
+                self.ticked = event.at - TICK;
+            }
             self.fleet.tick(self.ticked);
             let at_s = (self.ticked - from) as f64 * 1e-9;
             for car in self.fleet.cars() {
@@ -254,6 +328,7 @@ impl Collector {
             let timeline = self.timelines.entry(event.car.clone()).or_default();
             timeline.add(event, car, at_s);
         }
+        let shows = |topic| self.fleet.car(&event.car).is_some_and(|car| car.shows(topic));
         let series = self.series.entry(event.car.clone()).or_default();
         let EventPayload::Message {
             topic,
@@ -265,18 +340,15 @@ impl Collector {
             return;
         };
         match &**telemetry {
+            Telemetry::Pose(_) | Telemetry::Health(_) if !shows(*topic) => {}
             Telemetry::Pose(pose) => {
                 let point = PosePoint {
                     sensor: header.sensor,
                     pose: pose.pose,
                 };
-                if topic.recorded() {
-                    self.full_rate.entry(event.car.clone()).or_default().push(point);
-                } else {
-                    series.poses.push(point);
-                }
+                series.poses.push(point);
             }
-            Telemetry::Health(health) if *topic == Topic::Health => {
+            Telemetry::Health(health) => {
                 if let Some(metrics) = &health.metrics {
                     series.healths.push(HealthPoint {
                         at_s,
@@ -330,17 +402,11 @@ impl Collector {
         let mut cars = Vec::new();
         for (name, mut series) in self.series {
             let car = self.fleet.car(&name)?;
-            // The full-rate stream has every pose; the live one may have gaps.
-            if let Some(full) = self.full_rate.remove(&name)
-                && full.len() > series.poses.len()
-            {
-                series.poses = full;
-            }
             series.poses.sort_by_key(|point| point.sensor);
             series.truths.sort_by_key(|(at, _)| *at);
             series.map = car.map.as_ref().map(|(map, _)| map.clone());
             series.length = car.lap_length();
-            let view = car.view(to);
+            series.coverage = self.coverage.remove(&name).unwrap_or_default();
             let timeline = self.timelines.remove(&name).unwrap_or_default();
             let book = books.get(&name).cloned().unwrap_or_default();
             let mean = |i: usize| {
@@ -356,7 +422,7 @@ impl Collector {
                 truth: true_error(&series.poses, &series.truths),
                 cpu: mean(1),
                 update_p99_ms: series.loads.iter().map(|load| load[2]).max_by(f64::total_cmp),
-                missing: view.streams.values().map(|stream| stream.missing).sum(),
+                missing: self.missing.get(&name).copied().unwrap_or_default(),
                 car: name,
                 series,
                 timeline,
@@ -412,7 +478,8 @@ fn table(laps: &[Lap], kinds: &[Option<&'static str>]) -> Vec<TableRow> {
             set: set.to_owned(),
             laps: laps.len(),
             left_out: laps.len() - counted.len(),
-            time_s: values(&|lap| Some(lap.time_s))?,
+            // Laps that do not count have no part in the mean, unless there are no others.
+            time_s: MeanSigma::of(&counted).or_else(|| values(&|lap| Some(lap.time_s)))?,
             quartiles_s: quartiles(counted),
             lateral_m: values(&|lap| lap.lateral_m),
             alignment: values(&|lap| Some(lap.grip?.alignment)).map(|alignment| alignment.mean),
@@ -438,7 +505,8 @@ fn states(healths: &[HealthPoint]) -> BTreeMap<String, f64> {
     let mut lasted: BTreeMap<String, f64> = BTreeMap::new();
     for pair in healths.windows(2) {
         let time = pair[1].at_s - pair[0].at_s;
-        if time < PAUSE_S {
+        // In a recording of an older version the laptop's clock may have been set back.
+        if (0.0..PAUSE_S).contains(&time) {
             *lasted.entry(pair[0].state.to_string()).or_default() += time;
         }
     }
@@ -497,6 +565,7 @@ mod tests {
         Lap {
             lap,
             time_s,
+            void: None,
             set: set.into(),
             sectors_s: [None; 3],
             grip: Some(LapGrip {

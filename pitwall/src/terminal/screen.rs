@@ -206,7 +206,7 @@ impl Shown {
                 .as_ref()
                 .map_or("-".to_owned(), |set| format!("{} r{}", set.name, set.revision));
             let state = format!("{} {}", shape_of(&car.state), car.state);
-            let missing: u64 = car.streams.values().map(|stream| stream.missing).sum();
+            let missing = car.missing;
             let quiet = if car.blind {
                 Modifier::DIM
             } else {

@@ -15,7 +15,7 @@ pub(crate) fn table(cars: &[CarView]) -> String {
             .as_ref()
             .map_or("-".to_owned(), |set| format!("{} r{}", set.name, set.revision));
         let rate = car.streams.get("pose").map_or(0.0, |stream| stream.rate_hz);
-        let missing: u64 = car.streams.values().map(|stream| stream.missing).sum();
+        let missing = car.missing;
         let lines = format!(
             "\n{:<12} {:<13} {:<16} {:>7.1} {:>7} {:>8} {:>8} {:>7}  {}",
             car.car,
@@ -91,7 +91,7 @@ pub(crate) fn card(car: &CarView) -> String {
         ));
     }
     let rate = |topic: &str| car.streams.get(topic).map_or(0.0, |stream| stream.rate_hz);
-    let missing: u64 = car.streams.values().map(|stream| stream.missing).sum();
+    let missing = car.missing;
     let recovered: u64 = car.streams.values().map(|stream| stream.filled_late).sum();
     lines.push(format!(
         "link    pose {:.1}/s  cloud {:.1}/s  health {:.1}/s  age {} ms  RTT {} ms  clock {} +/- {} ms  missing {missing}  recovered {recovered}",

@@ -1,5 +1,7 @@
 //! Requests of the page.
 
+use std::path::PathBuf;
+
 use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
@@ -11,6 +13,7 @@ use serde_json::json;
 use super::App;
 use crate::clock::unix_now;
 use crate::network::{REPLY_TIMEOUT, new_command_id};
+use crate::recording::RecorderOptions;
 
 /// The map of a car.
 pub(super) async fn map(State(app): State<App>, Path(car): Path<CarName>) -> Response {
@@ -66,12 +69,14 @@ pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandR
 #[serde(deny_unknown_fields)]
 pub(super) struct RecordRequest {
     on: bool,
+    /// Another folder than the usual one, such as after the disk was full.
+    folder: Option<PathBuf>,
     operator: String,
 }
 
 /// Starts or stops a recording, in a file named by the time.
 pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordRequest>) -> Response {
-    let RecordRequest { on, operator } = request;
+    let RecordRequest { on, folder, operator } = request;
     let Some(service) = &app.service else {
         return in_a_replay();
     };
@@ -85,10 +90,13 @@ pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordReq
             .add_entry(unix_now(), None, severity, "recorder", text, who);
     };
     if on {
-        let file = app
-            .recordings
-            .join(format!("session-{}.mcap", unix_now() / 1_000_000_000));
-        match service.start_recording(&file).await {
+        let folder = folder.unwrap_or_else(|| app.recordings.to_path_buf());
+        let file = folder.join(service.session_name());
+        let options = RecorderOptions {
+            operator: operator.clone(),
+            ..app.recorder.clone()
+        };
+        match service.start_recording_with(&file, options).await {
             Ok(()) => {
                 log(Severity::Info, format!("recording into {}", file.display()));
                 Json(json!({"recording": file.display().to_string()})).into_response()
@@ -143,7 +151,7 @@ pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest
     if app.bus.fleet().car(&car).is_none() {
         return (StatusCode::NOT_FOUND, format!("no such car: {car}")).into_response();
     }
-    service.mark(&car, &operator, &text);
+    service.mark(&car, &operator, &text).await;
     StatusCode::NO_CONTENT.into_response()
 }
 

@@ -49,6 +49,7 @@ use tokio::task::JoinHandle;
 use crate::clock::unix_now;
 use crate::event_bus::EventBus;
 use crate::fleet_service::FleetService;
+use crate::recording::RecorderOptions;
 use crate::replay::Replay;
 use analysis::Sessions;
 pub(crate) use disk::free as free_space;
@@ -64,6 +65,8 @@ pub struct PageOptions {
     pub address: SocketAddr,
     /// The folder for recordings.
     pub recordings: PathBuf,
+    /// How to record.
+    pub recorder: RecorderOptions,
 }
 
 impl Default for PageOptions {
@@ -71,6 +74,7 @@ impl Default for PageOptions {
         Self {
             address: SocketAddr::from(([127, 0, 0, 1], 7448)),
             recordings: PathBuf::from("."),
+            recorder: RecorderOptions::default(),
         }
     }
 }
@@ -93,6 +97,7 @@ struct App {
     recordings: Arc<PathBuf>,
     address: SocketAddr,
     session_list: SessionList,
+    recorder: RecorderOptions,
     disk_free: watch::Receiver<Option<u64>>,
     operators: Operators,
     tracks: Tracks,
@@ -159,6 +164,7 @@ impl Page {
             recordings: Arc::new(options.recordings),
             address,
             session_list: SessionList::default(),
+            recorder: options.recorder,
             disk_free,
             operators: Operators::default(),
             stopping,
@@ -227,7 +233,16 @@ async fn watch_disk(
             _ = ticks.tick() => {}
             _ = stopping.wait_for(|stop| *stop) => return,
         }
-        let folder = folder.clone();
+        // While recording, the disk that is recorded to counts.
+        let recorded = bus
+            .recording()
+            .and_then(|(file, _)| file.parent().map(PathBuf::from));
+        let folder = match recorded {
+            // A bare file name is in the present folder.
+            Some(folder) if folder.as_os_str().is_empty() => PathBuf::from("."),
+            Some(folder) => folder,
+            None => folder.clone(),
+        };
         // A network drive may be slow.
         let Ok(free) = tokio::task::spawn_blocking(move || disk::free(&folder)).await else {
             return;

@@ -121,6 +121,7 @@ pub(super) async fn open(State(app): State<App>, Json(request): Json<OpenRequest
     let options = PageOptions {
         address,
         recordings: app.recordings.to_path_buf(),
+        ..PageOptions::default()
     };
     let page = match serve(replay.clone(), options).await {
         Ok(page) => page,

@@ -81,6 +81,8 @@ function take(next) {
   }
   track.update(next, selected);
   log.add(next.log, next.acknowledged, first);
+  if (next.recording) failed = false;
+  else if (next.log.some((entry) => entry.kind === "recorder" && entry.severity === "critical")) failed = true;
   showRecording(next);
   showReplay(next.replay);
   showPeople(next.operators);
@@ -124,6 +126,7 @@ function showPeople(names) {
 
 let saved = "";
 let ending = false;
+let failed = false;
 function showRecording({ recording, disk_free: free, replay }) {
   const button = $("record");
   button.hidden = Boolean(replay);
@@ -139,6 +142,9 @@ function showRecording({ recording, disk_free: free, replay }) {
     const left = free !== null && rate > 0 ? `, room for ${fixed(free / rate / 3600, 0)} h` : "";
     text = recording.error ?? `${lasting(recording.seconds)}, ${fixed(recording.bytes / 1e6, 1)} MB${left}, ${missing ? `${missing} MISSING` : "nothing missing"}`;
   }
+  // The pit wall ends a recording that has failed, and logs it.
+  document.body.classList.toggle("recording-failed", Boolean(recording?.error) || failed);
+  if (failed && !recording) text = "RECORDING FAILED: start another one";
   if (ending) text = "ending: waiting for missing messages";
   if ($("recording").textContent !== text) $("recording").textContent = text;
   // In full, where the room does not suffice.
@@ -151,6 +157,7 @@ async function record() {
   $("record").disabled = true;
   ending = !on;
   const { ok, body } = await post("/record", { on, operator: operator.value });
+  if (ok) failed = false;
   ending = false;
   $("record").disabled = false;
   if (!ok || on) {

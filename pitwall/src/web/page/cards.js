@@ -46,7 +46,10 @@ const ms = (value) => (value >= 1000 ? lasting(value / 1e3) : fixed(value, value
 /// How old the pose is.
 const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed(pose && pose.age_s * 1e3, 0, " ms"));
 
-export const missing = (car) => Object.values(car.streams).reduce((sum, s) => sum + s.missing, 0);
+export const missing = (car) => car.missing;
+
+/// Never rounded up to all.
+const share = (value) => (value === null || value === undefined ? "–" : value === 1 ? "100 %" : fixed(Math.min(value * 100, 99.99), 2, " %"));
 
 /// Label, text, warning condition, and tooltip.
 export const FACTS = [
@@ -61,7 +64,8 @@ export const FACTS = [
   ["update p99", (c) => ms(c.load && c.load.update_us.p99 / 1e3), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
   ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
   ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – if the machine does not report it"],
-  ["missing", (c) => String(missing(c)), null, "messages that were sent and did not arrive"],
+  ["missing", (c) => String(missing(c)), null, "messages whose content was sent and has not arrived"],
+  ["coverage", (c) => share(c.coverage), (c) => c.coverage < 0.999, "share of what the car sent that is here, of the streams that must be complete"],
 ];
 
 /// The state of the recording on a car's own disk.

@@ -133,7 +133,7 @@ export function showLaps(table, laps, car) {
   const key = `${car}:${laps.length}:${laps.at(-1)?.lap}`;
   if (table.dataset.key === key) return;
   table.dataset.key = key;
-  const best = Math.min(...laps.map((lap) => lap.time_s));
+  const best = Math.min(...laps.filter((lap) => !lap.void).map((lap) => lap.time_s));
   const sectors = [0, 1, 2].map((i) => Math.min(...laps.map((lap) => lap.sectors_s[i] ?? Infinity)));
   const head = rowOf("th", [[car ?? "", ""], ["time", "number"], ["to best", "number"], ["S1", "number"], ["S2", "number"], ["S3", "number"], ["set", ""],
     ["slip", "number", "share of the lap in which wheels slipped by more than 8 %"]]);
@@ -142,7 +142,7 @@ export function showLaps(table, laps, car) {
     const slips = grip && grip.slipping > 0.1;
     const about = grip ? `worst slip ${fixed(grip.worst_slip * 100, 0)} %, mean alignment ${fixed(grip.alignment * 100, 0)} %, mean distance from the raceline ${fixed(lap.lateral_m && lap.lateral_m * 100, 1)} cm` : "";
     return rowOf("td", [
-      [String(lap.lap), "number"], [fixed(lap.time_s, 3), `number${lap.time_s === best ? " best" : ""}`], [`+${fixed(lap.time_s - best, 3)}`, "number"],
+      [String(lap.lap), "number"], [fixed(lap.time_s, 3), `number${lap.void ? " void" : lap.time_s === best ? " best" : ""}`, lap.void ?? ""], [lap.void ? "void" : `+${fixed(lap.time_s - best, 3)}`, "number", lap.void ?? ""],
       ...lap.sectors_s.map((s, i) => [fixed(s, 2), `number${s !== null && s === sectors[i] ? " best" : ""}`]),
       [lap.set, "set", lap.set], [grip ? `${slips ? "▲" : ""}${fixed(grip.slipping * 100, 0)} %` : "–", `number${slips ? " warn" : ""}`, about],
     ]);

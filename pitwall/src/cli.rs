@@ -321,8 +321,8 @@ pub(crate) enum ParamsVerb {
 #[derive(Debug, Args)]
 pub(crate) struct OnCar {
     /// Have this car record on its own disk. It goes on until it is stopped, over restarts, too.
-    #[arg(long, value_name = "CAR", conflicts_with_all = ["output", "time"])]
-    pub(crate) on_car: Option<CarName>,
+    #[arg(id = "on_car", long = "on-car", value_name = "CAR", conflicts_with_all = ["output", "time"])]
+    pub(crate) car: Option<CarName>,
     /// With --on-car: end the recording.
     #[arg(long, requires = "on_car")]
     pub(crate) stop: bool,

@@ -468,3 +468,72 @@ async fn a_recording_is_replayed_on_the_same_page() {
     replay.stop();
     drop(guard);
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_is_found_and_replayed_beside_the_live_view() {
+    let bench = TestBench::start().await;
+    let service = bench.server.service();
+    let car = FakeCar::start("car-1", &bench.endpoint, Behaviour::default()).await;
+    let file = bench.recordings.path().join("wet-morning.mcap");
+    service.start_recording(&file).await.expect("a new file");
+    wait_until("two laps are recorded", || {
+        service
+            .fleet()
+            .car(car.name())
+            .is_some_and(|car| car.laps().len() >= 2)
+    })
+    .await;
+    service
+        .stop_recording()
+        .await
+        .expect("a recording")
+        .expect("a good file");
+    std::fs::write(bench.recordings.path().join("torn.mcap"), b"no recording").expect("written");
+
+    let browser = bench.browser().await;
+    browser.wait("the car is there", &card("car-1")).await;
+    browser.click("#sessions-button").await;
+    let rows = "[...document.querySelectorAll('#sessions-table tr')].map((row) => row.innerText)";
+    browser
+        .wait(
+            "both files are listed, and the index is read",
+            &format!(
+                "{rows}.length === 3 && document.getElementById('sessions-said').textContent === '2 sessions'"
+            ),
+        )
+        .await;
+    browser.screenshot("page-sessions").await;
+    let listed = browser.evaluate(&format!("{rows}.join(' / ')")).await;
+    let listed = listed.as_str().unwrap_or_default();
+    assert!(
+        listed.contains("DAMAGED") && listed.contains("nothing"),
+        "{listed}"
+    );
+    browser.fill("#sessions-words", "wet CAR-1").await;
+    browser
+        .wait(
+            "one is left",
+            &format!("{rows}.length === 2 && {rows}[1].includes('wet-morning')"),
+        )
+        .await;
+    // The test has no second tab: the address is what counts.
+    browser
+        .evaluate("window.open = () => ({ close() {}, set location(url) { window.opened = url; } })")
+        .await;
+    browser.click("#sessions-table button").await;
+    let url = browser.wait("its page is served", "window.opened").await;
+    let replay = Browser::open(url.as_str().expect("an address"), 1366, 768).await;
+    replay
+        .wait(
+            "the recording is played there",
+            "pitwall.snapshot?.replay?.file.endsWith('wet-morning.mcap')",
+        )
+        .await;
+    replay.close().await;
+    let live = browser.evaluate("pitwall.snapshot.replay").await;
+    assert!(live.is_null(), "the first page is still live");
+    browser.expect_clean(bench.server.url()).await;
+    browser.close().await;
+    drop(car);
+    bench.server.stop().await;
+}

@@ -66,7 +66,7 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let patience = if follow { wait } else { FIND };
             events::run(&network, car, follow, patience, json).await
         }
-        Verb::Record { output, on_car, time } => match on_car.on_car {
+        Verb::Record { output, on_car, time } => match on_car.car {
             Some(car) => {
                 let action = match (on_car.stop, on_car.state) {
                     (true, _) => RecordAction::Stop,

@@ -14,7 +14,7 @@ pub(super) fn run(folder: &Path, words: &[String], rebuild: bool, json: bool) ->
         index.clear()?;
     }
     index.refresh(None, |file| {
-        output::print_note(&format!("reading {}", file.display()))
+        output::print_note(&format!("reading {}", file.display()));
     })?;
     let sessions = index.search(&words.join(" "))?;
     if json {

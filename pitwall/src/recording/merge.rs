@@ -92,12 +92,9 @@ fn recordings_in(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).map_err(io)? {
         let path = entry.map_err(io)?.path();
-        let name = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        if path.is_file() && (name.ends_with(".mcap") || name.ends_with(&format!(".mcap.{PART}"))) {
+        let recording = |path: &Path| path.extension().is_some_and(|end| end == "mcap");
+        let fetched = path.extension().is_some_and(|end| end == PART) && recording(&path.with_extension(""));
+        if path.is_file() && (recording(&path) || fetched) {
             files.push(path);
         }
     }
@@ -700,7 +697,7 @@ mod tests {
             let count: u64 = ranges.0.iter().map(|(first, range)| range.last - first + 1).sum();
             prop_assert_eq!(count, numbers.len() as u64);
             // No two ranges touch.
-            for (first, _) in &ranges.0 {
+            for first in ranges.0.keys() {
                 prop_assert!(*first == 0 || !ranges.contains(first - 1));
             }
             let between = ranges.between(probe, 7);

@@ -271,7 +271,10 @@ fn find(folder: &Path, depth: usize, found: &mut BTreeMap<PathBuf, Stamp>) -> st
                 if let Err(error) = walk(root, &path, depth - 1, found) {
                     tracing::warn!(folder = %path.display(), %error, "skipped");
                 }
-            } else if kind.is_file() && name.ends_with(".mcap") && found.len() < MAX_FILES {
+            } else if kind.is_file()
+                && path.extension().is_some_and(|end| end == "mcap")
+                && found.len() < MAX_FILES
+            {
                 let metadata = entry.metadata()?;
                 let modified = metadata
                     .modified()
@@ -326,7 +329,7 @@ struct Content {
 impl Content {
     fn read(&mut self, path: &Path) -> Result<(), RecordingError> {
         let mut events = read_intact(path)?;
-        while let Some(event) = events.next() {
+        for event in events.by_ref() {
             self.add(&event?);
         }
         self.session.on_car = events.library().starts_with(super::CAR_LIBRARY);

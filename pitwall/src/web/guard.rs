@@ -15,6 +15,7 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
                       connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
 /// Accepts requests of the page's own origin, and on a network only with the token.
+#[derive(Clone)]
 pub(super) struct Guard {
     token: Option<String>,
 }

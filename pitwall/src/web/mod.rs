@@ -96,6 +96,7 @@ struct App {
     replay: Option<Arc<Replay>>,
     recordings: Arc<PathBuf>,
     address: SocketAddr,
+    guard: Guard,
     session_list: SessionList,
     recorder: RecorderOptions,
     disk_free: watch::Receiver<Option<u64>>,
@@ -127,12 +128,17 @@ impl App {
 impl Page {
     /// Binds the address and serves until [`Page::stop`].
     pub async fn serve(service: Arc<FleetService>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(service.bus().clone(), Some(service), None, options).await
+        Self::serve_from(service.bus().clone(), Some(service), None, options, None).await
     }
 
     /// Serves a replay.
     pub async fn serve_replay(replay: Arc<Replay>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(replay.bus().clone(), None, Some(replay), options).await
+        Self::serve_from(replay.bus().clone(), None, Some(replay), options, None).await
+    }
+
+    /// Serves a replay to those whom the guard of another page admits. A browser keeps one token for all ports of an address.
+    async fn serve_beside(replay: Arc<Replay>, options: PageOptions, guard: Guard) -> std::io::Result<Self> {
+        Self::serve_from(replay.bus().clone(), None, Some(replay), options, Some(guard)).await
     }
 
     async fn serve_from(
@@ -140,10 +146,11 @@ impl Page {
         service: Option<Arc<FleetService>>,
         replay: Option<Arc<Replay>>,
         options: PageOptions,
+        guard: Option<Guard>,
     ) -> std::io::Result<Self> {
         let listener = TcpListener::bind(options.address).await?;
         let address = listener.local_addr()?;
-        let guard = Guard::new(address);
+        let guard = guard.unwrap_or_else(|| Guard::new(address));
         let url = guard.url(address);
         let (stop, stopping) = watch::channel(false);
         let (room, disk_free) = watch::channel(None);
@@ -163,6 +170,7 @@ impl Page {
             sessions: Sessions::default(),
             recordings: Arc::new(options.recordings),
             address,
+            guard: guard.clone(),
             session_list: SessionList::default(),
             recorder: options.recorder,
             disk_free,

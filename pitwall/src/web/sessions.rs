@@ -13,6 +13,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use serde_json::json;
 
+use super::guard::Guard;
 use super::{App, Page, PageOptions};
 use crate::recording::{Session, SessionIndex, SessionIndexError};
 use crate::replay::Replay;
@@ -123,7 +124,7 @@ pub(super) async fn open(State(app): State<App>, Json(request): Json<OpenRequest
         recordings: app.recordings.to_path_buf(),
         ..PageOptions::default()
     };
-    let page = match serve(replay.clone(), options).await {
+    let page = match serve(replay.clone(), options, app.guard.clone()).await {
         Ok(page) => page,
         Err(error) => {
             replay.stop();
@@ -154,6 +155,7 @@ pub(super) async fn open(State(app): State<App>, Json(request): Json<OpenRequest
 fn serve(
     replay: Arc<Replay>,
     options: PageOptions,
+    guard: Guard,
 ) -> Pin<Box<dyn Future<Output = std::io::Result<Page>> + Send>> {
-    Box::pin(Page::serve_replay(replay, options))
+    Box::pin(Page::serve_beside(replay, options, guard))
 }

@@ -7,7 +7,7 @@ import { element, fixed } from "/cards.js";
 const AGAIN = 700;
 
 const COLUMNS = [
-  ["date", (s) => new Date(s.started / 1e6).toLocaleString()],
+  ["date", (s) => s.started ? new Date(s.started / 1e6).toLocaleString() : "–"],
   ["length", (s) => `${Math.floor(s.duration_s / 60)}:${String(Math.floor(s.duration_s % 60)).padStart(2, "0")}`],
   ["track", (s) => s.track ?? "–"],
   ["cars", (s) => s.cars.join(", ")],

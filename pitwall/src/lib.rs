@@ -66,8 +66,8 @@ pub use clock::unix_now;
 pub use event::{Delivery, EventPayload, EventSink, FleetEvent, Rejection, SentRange};
 pub use event_bus::{EventBus, FleetGuard};
 pub use fleet::{
-    Car, CarView, Fleet, GapSummary, HealthSample, Lap, LapGrip, Log, LogEntry, PoseView, ProfileCell,
-    SECTORS, SequenceStatus, SequenceTracker, SetView, StreamStatistics, StreamView,
+    Car, CarView, Fleet, GapSummary, HealthSample, Lap, LapGrip, Limits, Log, LogEntry, PoseView,
+    ProfileCell, SECTORS, SequenceStatus, SequenceTracker, SetView, StreamStatistics, StreamView,
 };
 pub use fleet_service::{FleetService, StartRecordingError};
 pub use network::{

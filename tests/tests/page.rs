@@ -111,6 +111,15 @@ async fn until_done(browser: &Browser, car: &str, act: impl AsyncFn()) -> String
     panic!("no answer of {car} came in time");
 }
 
+/// Waits for a question and gives its first answer.
+async fn answer_question(browser: &Browser, question: &str) {
+    let asked = format!(
+        "document.getElementById('ask').open && document.getElementById('ask-text').textContent.includes('{question}')"
+    );
+    browser.wait("the page asks first", &asked).await;
+    browser.click("#ask-answers button").await;
+}
+
 /// A race engineer watches three cars, switches a set, sets a pose, and sees one car fall silent.
 #[tokio::test(flavor = "multi_thread")]
 async fn three_cars_are_shown_switched_relocated_and_lost() {
@@ -311,6 +320,7 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
 
     // Relocalization returns candidates to choose from.
     browser.key("g").await;
+    answer_question(&browser, "Search the whole map for car-1?").await;
     browser
         .wait(
             "three candidates",
@@ -353,6 +363,7 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
         .wait("the marker is in the log", &logged("rain at turn two [ana]"))
         .await;
     browser.key("r").await;
+    answer_question(&browser, "Stop the recording?").await;
     browser
         .wait(
             "it is saved",
@@ -535,5 +546,198 @@ async fn a_session_is_found_and_replayed_beside_the_live_view() {
     browser.expect_clean(bench.server.url()).await;
     browser.close().await;
     drop(car);
+    bench.server.stop().await;
+}
+
+/// A car's laps are laid over each other by the track coordinate; sectors are drawn and kept; health is shown over the
+/// track.
+#[tokio::test(flavor = "multi_thread")]
+async fn laps_and_health_are_compared_over_the_track() {
+    let bench = TestBench::start().await;
+    let behind = Behaviour {
+        updates_behind: 20,
+        ..Behaviour::default()
+    };
+    let cars = [
+        FakeCar::start("car-1", &bench.endpoint, Behaviour::default()).await,
+        FakeCar::start("car-2", &bench.endpoint, behind).await,
+    ];
+    let ana = bench.browser().await;
+    ana.key("d").await;
+    ana.wait(
+        "each car has two laps that count",
+        "['car-1', 'car-2'].every((car) => [...document.querySelectorAll('.an-laps tr.flying')].filter((row) => row.innerText.includes(car)).length >= 2)",
+    )
+    .await;
+    ana.wait(
+        "the best lap of each car is chosen and loaded",
+        "pitwall.analysis.chosen.length === 2 && pitwall.analysis.chosen.every((id) => pitwall.analysis.numbers(id))",
+    )
+    .await;
+    // Fake cars drive a ring at one speed: 3 m times pi a second, 0 m off the line.
+    let at = "((a) => { const track = a.trackOf(); const id = a.chosen[0]; return [a.valueAt(id, 'speed', track, 9), a.valueAt(id, 'lateral', track, 9), \
+              a.valueAt(id, 'alignment', track, 9), a.timeAt(a.numbers(id), track, track.length / 2)]; })(pitwall.analysis)";
+    let values = ana.evaluate(at).await;
+    for (i, expected, tolerance) in [(0, 9.425, 0.01), (1, 0.0, 0.01), (2, 0.9, 0.001), (3, 1.0, 0.1)] {
+        let value = number(&values[i]);
+        assert!((value - expected).abs() < tolerance, "value {i}: {value}");
+    }
+    // The cursor is moved by keys, and a second one shows differences.
+    ana.click("[data-mode=laps]").await;
+    ana.evaluate("document.querySelector('.an-plots').focus()").await;
+    let press = |key: &str, shift: bool| {
+        format!(
+            "document.querySelector('.an-plots').dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', shiftKey: {shift}, bubbles: true}}))"
+        )
+    };
+    for _ in 0..8 {
+        ana.evaluate(&press("ArrowRight", false)).await;
+    }
+    ana.evaluate(&press("ArrowRight", true)).await;
+    ana.wait(
+        "values and differences at two cursors",
+        "document.querySelector('.an-readout')?.innerText.match(/→/)",
+    )
+    .await;
+    for (width, height) in [(1366, 768), (1920, 1080), (390, 844)] {
+        ana.resize(width, height).await;
+        let overflow = "document.documentElement.scrollWidth <= innerWidth";
+        ana.wait("nothing is wider than the page", overflow).await;
+        ana.screenshot(&format!("analysis-{width}")).await;
+    }
+    ana.resize(1366, 768).await;
+
+    // Sectors are drawn by clicks on the track, and kept for all pages and runs.
+    ana.wait(
+        "the map is drawn",
+        "document.querySelector('.an-map').width > 100",
+    )
+    .await;
+    let edit = "[...document.querySelectorAll('.an-right .an-bar button')].find((b) => b.textContent.includes('sectors')).click()";
+    ana.evaluate(edit).await;
+    let point = "((a) => { const track = a.trackOf(); const [x, y] = a.mapView(track).to(a.pointAt(track, 9.42)); \
+                 a.map.scrollIntoView({ block: 'center' }); const box = a.map.getBoundingClientRect(); return [box.left + x, box.top + y]; })(pitwall.analysis)";
+    let point = ana.evaluate(point).await;
+    let point = [number(&point[0]), number(&point[1])];
+    ana.drag(point, point).await;
+    ana.wait("a border more", "pitwall.analysis.borders?.length === 3")
+        .await;
+    ana.evaluate(edit).await;
+    let four = "pitwall.analysis?.view?.tracks[0]?.sectors.length === 3 && pitwall.analysis.borders === null";
+    ana.wait("four sectors are kept", four).await;
+    let ben = bench.browser().await;
+    ben.key("d").await;
+    ben.wait("another page has them", four).await;
+    let kept = std::fs::read_dir(bench.recordings.path().join("tracks")).expect("a folder of tracks");
+    assert_eq!(kept.count(), 1);
+    // The sectors of a lap add up to its time, and none is faster than the ideal lap's.
+    let sums = "pitwall.analysis.view.laps.filter((lap) => lap.kind === 'flying' && lap.time_s).map((lap) => [lap.time_s, lap.sectors.reduce((a, b) => a + b, 0), \
+                pitwall.analysis.view.tracks[0].ideal.reduce((a, b) => a + b, 0)])";
+    let sums = ben.evaluate(sums).await;
+    let sums = sums.as_array().expect("laps");
+    assert!(sums.len() >= 4);
+    for lap in sums {
+        let [time, sum, ideal] = [0, 1, 2].map(|i| number(&lap[i]));
+        // Fake cars report 2 s for every lap, whatever the machine's timer did.
+        assert!((time - sum).abs() < 0.5 && ideal <= sum + 1e-6, "{lap}");
+    }
+
+    // Health over the track.
+    ana.click("[data-mode=health]").await;
+    ana.wait("the heat-map has rows", "pitwall.analysis.heatRows?.length >= 4")
+        .await;
+    let canvas = ana
+        .evaluate("((box) => [box.left + box.width / 2, box.top + 30])(document.querySelector('.an-heat canvas:not(.an-legend)').getBoundingClientRect())")
+        .await;
+    let canvas = [number(&canvas[0]), number(&canvas[1])];
+    ana.drag(canvas, canvas).await;
+    ana.wait(
+        "lap, place, value and state in words",
+        "document.querySelector('.an-heat p').textContent.match(/car-\\d lap \\d+ at \\d+\\.\\d m: alignment 90\\.0 %, LOCALIZED/)",
+    )
+    .await;
+    ana.screenshot("analysis-health").await;
+    let none = "document.querySelector('.an-findings').innerText.includes('nowhere')";
+    ana.wait("nothing is wrong with the map", none).await;
+    for browser in [ana, ben] {
+        browser.expect_clean(bench.server.url()).await;
+        browser.close().await;
+    }
+    drop(cars);
+    bench.server.stop().await;
+}
+
+/// What a race engineer needs over two hours: alarms that stay, questions before what cannot be undone, the worst state in
+/// the title.
+#[tokio::test(flavor = "multi_thread")]
+async fn alarms_outlive_a_reload_and_a_gone_car_can_be_dismissed() {
+    let bench = TestBench::start().await;
+    let stays = FakeCar::start("car-1", &bench.endpoint, Behaviour::default()).await;
+    let goes = FakeCar::start("car-2", &bench.endpoint, Behaviour::default()).await;
+    let page = bench.browser().await;
+    page.wait("both cars in the title", "document.title.includes('2 localized')")
+        .await;
+    let small = "[...document.querySelectorAll('.card.selected .facts span')].every((label) => parseFloat(getComputedStyle(label).fontSize) >= 12) && \
+                 [...document.querySelectorAll('.card.selected .facts b')].every((value) => parseFloat(getComputedStyle(value).fontSize) >= 18)";
+    assert_eq!(
+        page.evaluate(small).await,
+        true,
+        "labels of 12 px, values of 18 px"
+    );
+
+    // Keys that change something ask first, and offer a trial.
+    page.key("L").await;
+    answer_question(&page, "Put set lq in force on car-1?").await;
+    let in_force = |set: &str| {
+        format!(
+            "{}.querySelector('button[data-set={set}]')?.getAttribute('aria-pressed') === 'true'",
+            card("car-1")
+        )
+    };
+    page.wait("lq is in force", &in_force("lq")).await;
+    let trial = format!(
+        "[...{}.querySelectorAll('.note button')].find((b) => b.textContent === 'try hq 60 s')",
+        card("car-1")
+    );
+    page.wait("a trial is offered", &trial).await;
+    page.evaluate(&format!("{trial}.click()")).await;
+    page.wait("hq is in force", &in_force("hq")).await;
+
+    // Tabs by arrow keys.
+    page.evaluate("document.getElementById('tab-log').focus()").await;
+    page.evaluate("document.activeElement.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight', bubbles: true}))")
+        .await;
+    page.wait(
+        "the next tab",
+        "document.activeElement.id === 'tab-laps' && !document.getElementById('laps-panel').hidden",
+    )
+    .await;
+
+    drop(goes);
+    page.wait(
+        "the title shows the worst state",
+        "document.title.includes('BLIND car-2')",
+    )
+    .await;
+    let alarm = "!document.getElementById('alarm').hidden && document.querySelector('#log li.open')";
+    page.wait("an alarm", alarm).await;
+    page.evaluate("location.reload()").await;
+    page.wait("the alarm is there again", alarm).await;
+    page.screenshot("page-alarm-after-reload").await;
+    page.click("#alarm").await;
+    page.wait("no alarm is open", "document.getElementById('alarm').hidden")
+        .await;
+    let dismiss = format!(
+        "[...{}.querySelectorAll('header button')].find((b) => b.textContent === '✕' && !b.hidden)",
+        card("car-2")
+    );
+    page.wait("the gone car can be hidden", &dismiss).await;
+    page.evaluate(&format!("{dismiss}.click()")).await;
+    page.wait("it is hidden", &format!("!{}", card("car-2"))).await;
+    let back = FakeCar::start("car-2", &bench.endpoint, Behaviour::default()).await;
+    page.wait("it is back", &card("car-2")).await;
+    page.expect_clean(bench.server.url()).await;
+    page.close().await;
+    drop((stays, back));
     bench.server.stop().await;
 }

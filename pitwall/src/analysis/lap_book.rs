@@ -75,6 +75,7 @@ pub struct LapBook {
     pose: Option<Sample<4>>,
     health: Option<Sample<9>>,
     update_ms: Option<f32>,
+    sigma: Option<f32>,
     /// True while the newest lap in `laps` may still get its last cells of health and its time.
     closing: bool,
 }
@@ -137,6 +138,24 @@ impl LapBook {
         self.open.as_ref().map(|open| &open.trace)
     }
 
+    /// The newest value of a channel; None before there is one.
+    pub fn newest(&self, channel: Channel) -> Option<f64> {
+        let of = |values: &[(Channel, f32)]| {
+            values
+                .iter()
+                .find(|(other, _)| *other == channel)
+                .map(|(_, v)| f64::from(*v))
+        };
+        match channel {
+            Channel::UpdateTime => self.update_ms.map(f64::from),
+            Channel::Sigma => self.sigma.map(f64::from),
+            _ => self
+                .pose
+                .and_then(|pose| of(&pose.values))
+                .or_else(|| self.health.and_then(|health| of(&health.values))),
+        }
+    }
+
     /// Arc length of the newest pose \[m\].
     pub fn s(&self) -> Option<f64> {
         self.pose.map(|pose| pose.s)
@@ -174,6 +193,8 @@ impl LapBook {
                 (Channel::YawRate, pose.yaw_rate as f32),
             ],
         };
+        let sigma = pose.sigma as f32;
+        self.sigma = Some(sigma);
         let before = self.pose.filter(|before| before.at < pose.at);
         if self.pose.is_some() && before.is_none() {
             return;
@@ -200,7 +221,6 @@ impl LapBook {
             }
             return;
         }
-        let sigma = pose.sigma as f32;
         let end = before.s + ahead;
         if crossed {
             let share = (length - before.s) / ahead;

@@ -19,6 +19,7 @@ mod track_line;
 mod view;
 
 pub use channel::Channel;
+pub(crate) use channel::Worse;
 pub use lap_book::{LapBook, PoseSample};
 pub use lap_trace::{Invalid, LapKind, LapTrace};
 pub use map_check::{Disagreement, MapCheck, MapFinding};

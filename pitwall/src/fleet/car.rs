@@ -13,6 +13,7 @@ use crate::analysis::{LapBook, MapCheck, PoseSample, TrackLine};
 use super::clock_estimate::ClockEstimate;
 use super::history::{HealthHistory, HealthProfile, HealthSample, ProfileCell};
 use super::laps::{Lap, LapTimer, TrackPose};
+use super::limits::{LimitWatch, Limits};
 use super::stream_statistics::{Freshness, StreamStatistics};
 
 /// A car, as the pit wall knows it.
@@ -32,6 +33,8 @@ pub struct Car {
     pub last_heard: i64,
     /// True when the log has an entry that the link is lost, until it is back.
     pub(crate) blind_logged: bool,
+    /// True while an operator has hidden it, because it is gone.
+    pub(crate) dismissed: bool,
     /// True when the log has an entry that health messages no longer come, until they do.
     pub(crate) stale_logged: bool,
     /// When a message of a second sender of this name was last dropped \[unix ns\].
@@ -63,6 +66,7 @@ pub struct Car {
     laps: LapTimer,
     book: LapBook,
     map_check: Option<MapCheck>,
+    limit_watch: LimitWatch,
     history: HealthHistory,
     health_profile: HealthProfile,
     clock: Option<ClockEstimate>,
@@ -87,6 +91,7 @@ impl Car {
             first_seen: at,
             last_heard: at,
             blind_logged: false,
+            dismissed: false,
             stale_logged: false,
             two_senders: None,
             pose: None,
@@ -104,6 +109,7 @@ impl Car {
             laps: LapTimer::default(),
             book: LapBook::default(),
             map_check: None,
+            limit_watch: LimitWatch::default(),
             history: HealthHistory::default(),
             health_profile: HealthProfile::default(),
             clock: None,
@@ -214,6 +220,33 @@ impl Car {
             self.map_check = Some(MapCheck::new(line));
         }
         self.map = Some((map, bytes));
+    }
+
+    /// The metrics that have just gone beyond the engineer's limits, in words. `at` is the sensor's time \[ns\].
+    pub(super) fn beyond_limits(&mut self, limits: &BTreeMap<String, Limits>, at: i64) -> Vec<String> {
+        let Some(limits) = self.book.line().and_then(|line| limits.get(&line.key)) else {
+            return Vec::new();
+        };
+        let mut watch = std::mem::take(&mut self.limit_watch);
+        let raised = watch.check(limits, at, |channel| self.book.newest(channel));
+        self.limit_watch = watch;
+        let place = self
+            .book
+            .s()
+            .map_or_else(String::new, |s| format!(" at s = {s:.1} m"));
+        raised
+            .into_iter()
+            .map(|(channel, value, limit)| {
+                let info = channel.info();
+                let show = |v: f64| format!("{:.*} {}", usize::from(info.digits), v * info.factor, info.unit);
+                format!(
+                    "{} {} beyond the limit of {}{place}",
+                    info.label,
+                    show(value),
+                    show(limit)
+                )
+            })
+            .collect()
     }
 
     /// Its laps over the track.

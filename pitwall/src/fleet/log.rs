@@ -31,10 +31,14 @@ pub struct Log {
     count: u64,
     /// Alarms up to this entry are acknowledged.
     acknowledged: u64,
+    /// Alarms that nobody has acknowledged, the oldest first. They stay when their entries have gone.
+    open: VecDeque<LogEntry>,
 }
 
 impl Log {
     const MAX_ENTRIES: usize = 2000;
+    /// Most open alarms that are kept.
+    const MAX_OPEN: usize = 500;
 
     /// Adds an entry and sets its number.
     pub fn push(&mut self, mut entry: LogEntry) {
@@ -42,6 +46,12 @@ impl Log {
         entry.number = self.count;
         if self.entries.len() == Self::MAX_ENTRIES {
             self.entries.pop_front();
+        }
+        if entry.severity == Severity::Critical {
+            if self.open.len() == Self::MAX_OPEN {
+                self.open.pop_front();
+            }
+            self.open.push_back(entry.clone());
         }
         self.entries.push_back(entry);
     }
@@ -54,9 +64,12 @@ impl Log {
 
     /// Number of critical entries that nobody has acknowledged.
     pub fn alarms(&self) -> usize {
-        self.since(self.acknowledged)
-            .filter(|entry| entry.severity == Severity::Critical)
-            .count()
+        self.open.len()
+    }
+
+    /// The critical entries that nobody has acknowledged, the oldest first.
+    pub fn open(&self) -> impl Iterator<Item = &LogEntry> {
+        self.open.iter()
     }
 
     /// The number of the last acknowledged entry; 0 for none.
@@ -68,6 +81,7 @@ impl Log {
     pub(crate) fn acknowledge(&mut self) -> usize {
         let alarms = self.alarms();
         self.acknowledged = self.count;
+        self.open.clear();
         alarms
     }
 

@@ -5,6 +5,7 @@ mod car_view;
 mod clock_estimate;
 mod history;
 mod laps;
+mod limits;
 mod log;
 mod sequence_tracker;
 mod stream_statistics;
@@ -20,6 +21,7 @@ pub use car::Car;
 pub use car_view::{CarView, PoseView, SetView};
 pub use history::{HealthSample, ProfileCell};
 pub use laps::{Lap, LapGrip, SECTORS};
+pub use limits::Limits;
 pub use log::{Log, LogEntry};
 pub use sequence_tracker::{GapSummary, SequenceStatus, SequenceTracker};
 pub use stream_statistics::{StreamStatistics, StreamView};
@@ -33,6 +35,8 @@ pub struct Fleet {
     /// Cars of a recording that may come, see [`Car::read_from`].
     expected: BTreeMap<CarName, (bool, BTreeMap<u64, i64>)>,
     log: Log,
+    /// The engineer's limits by track, see `TrackLine::key`.
+    limits: BTreeMap<String, Limits>,
 }
 
 impl Fleet {
@@ -54,6 +58,7 @@ impl Fleet {
         match payload {
             EventPayload::Appeared => {
                 car.alive = true;
+                car.dismissed = false;
                 car.last_heard = car.last_heard.max(at);
             }
             EventPayload::Vanished => car.alive = false,
@@ -64,11 +69,19 @@ impl Fleet {
                 ..
             } => {
                 let is_new = car.apply(*topic, header, telemetry, at);
+                let raised = if is_new && *topic == Topic::Health {
+                    car.beyond_limits(&self.limits, header.sensor)
+                } else {
+                    Vec::new()
+                };
                 if let (Telemetry::Event(event), Topic::Event) = (&**telemetry, topic)
                     && is_new
                 {
                     let when = happened_at(header) - car.clock_offset();
                     self.log.push(entry_of(event, name, when));
+                }
+                for text in raised {
+                    self.add_entry(at, Some(name.clone()), Severity::Critical, "limit", text, None);
                 }
             }
             EventPayload::Unreadable { topic, header, error } => {
@@ -196,6 +209,34 @@ impl Fleet {
         }
     }
 
+    /// Sets the engineer's alarm limits on a track, see [`TrackLine::key`](crate::TrackLine::key).
+    pub fn set_limits(&mut self, track: &str, limits: Limits) {
+        self.limits.insert(track.to_owned(), limits);
+    }
+
+    /// The engineer's alarm limits on a track; None before they are set.
+    pub fn limits(&self, track: &str) -> Option<&Limits> {
+        self.limits.get(track)
+    }
+
+    /// Hides a car that is not connected, until something comes from it. False when it is connected or not known.
+    pub fn dismiss(&mut self, name: &CarName, at: i64, who: &str) -> bool {
+        let Some(car) = self.cars.get_mut(name).filter(|car| !car.alive) else {
+            return false;
+        };
+        car.dismissed = true;
+        let text = "dismissed: hidden until it is back".to_owned();
+        self.add_entry(
+            at,
+            Some(name.clone()),
+            Severity::Info,
+            "node",
+            text,
+            Some(who.to_owned()),
+        );
+        true
+    }
+
     /// The cars by name.
     pub fn cars(&self) -> impl Iterator<Item = &Car> {
         self.cars.values()
@@ -208,7 +249,10 @@ impl Fleet {
 
     /// All cars at `now` \[unix ns\].
     pub fn view(&self, now: i64) -> Vec<CarView> {
-        self.cars().map(|car| car.view(now)).collect()
+        self.cars()
+            .filter(|car| !car.dismissed)
+            .map(|car| car.view(now))
+            .collect()
     }
 
     /// The log.
@@ -529,6 +573,39 @@ mod tests {
         );
         fleet.add_entry(5, None, Severity::Critical, "link", "BLIND".into(), None);
         assert_eq!(fleet.log().alarms(), 1);
+    }
+
+    // They once went with their entries, while the car was still BLIND.
+    #[test]
+    fn an_open_alarm_outlives_two_thousand_other_entries() {
+        let mut fleet = Fleet::default();
+        fleet.add_entry(1, None, Severity::Critical, "link", "BLIND".into(), None);
+        for at in 2..2500 {
+            fleet.add_entry(at, None, Severity::Info, "lap", "lap".into(), None);
+        }
+        assert_eq!(fleet.log().alarms(), 1);
+        assert_eq!(
+            fleet.log().open().next().map(|entry| entry.text.as_str()),
+            Some("BLIND")
+        );
+        fleet.acknowledge(3000, "ana");
+        assert_eq!(fleet.log().open().count(), 0);
+    }
+
+    #[test]
+    fn a_dismissed_car_is_gone_until_something_comes_from_it() {
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        fleet.apply(&health(0, 1, Delivery::Live, State::Localized));
+        assert!(!fleet.dismiss(&name(), 1, "ana"), "a car that is connected stays");
+        fleet.apply(&FleetEvent {
+            payload: EventPayload::Vanished,
+            ..appeared(2)
+        });
+        assert!(fleet.dismiss(&name(), 3, "ana"));
+        assert!(fleet.view(4).is_empty());
+        fleet.apply(&appeared(5));
+        assert_eq!(fleet.view(6).len(), 1);
     }
 
     #[test]

@@ -83,6 +83,89 @@ pub(super) async fn lap(State(app): State<App>, Query(query): Query<LapQuery>) -
     }
 }
 
+/// Gives the fleet the limits that are kept with the tracks that cars are on.
+pub(super) fn load_limits(bus: &crate::event_bus::EventBus, tracks: &super::tracks::Tracks) {
+    let new: Vec<_> = {
+        let fleet = bus.fleet();
+        let lines = fleet.cars().filter_map(|car| car.book().line().cloned());
+        lines.filter(|line| fleet.limits(&line.key).is_none()).collect()
+    };
+    for line in new {
+        let limits = tracks.of(&line).limits;
+        bus.fleet().set_limits(&line.key, limits);
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct LimitsRequest {
+    car: protocol::CarName,
+    limits: BTreeMap<String, f64>,
+    operator: String,
+}
+
+/// The alarm limits on the track of a car, and the metrics that can have one.
+pub(super) async fn limits(
+    State(app): State<App>,
+    axum::extract::Path(car): axum::extract::Path<protocol::CarName>,
+) -> Response {
+    let line = app
+        .bus
+        .fleet()
+        .car(&car)
+        .and_then(|car| car.book().line().cloned());
+    let limits = line.map(|line| app.tracks.of(&line).limits);
+    let channels: Vec<_> = crate::analysis::Channel::ALL
+        .into_iter()
+        .map(crate::analysis::Channel::info)
+        .collect();
+    Json(json!({"limits": limits, "channels": channels})).into_response()
+}
+
+/// Sets the alarm limits on the track of a car, for all cars on it, and keeps them.
+pub(super) async fn set_limits(State(app): State<App>, Json(request): Json<LimitsRequest>) -> Response {
+    let LimitsRequest {
+        car,
+        limits,
+        operator,
+    } = request;
+    let Some(line) = app
+        .bus
+        .fleet()
+        .car(&car)
+        .and_then(|car| car.book().line().cloned())
+    else {
+        return (StatusCode::NOT_FOUND, format!("{car} has no track")).into_response();
+    };
+    let limits = match crate::fleet::Limits::new(limits) {
+        Ok(limits) if operator.len() <= protocol::Command::MAX_OPERATOR => limits,
+        Ok(_) => return (StatusCode::BAD_REQUEST, "too long").into_response(),
+        Err(fault) => return (StatusCode::BAD_REQUEST, fault).into_response(),
+    };
+    on_a_thread(move || {
+        if let Err(fault) = app.tracks.keep_limits(&line, limits.clone()) {
+            return (StatusCode::INTERNAL_SERVER_ERROR, fault).into_response();
+        }
+        let text = format!(
+            "alarm limits on {} are set: {} metrics",
+            line.name,
+            limits.iter().count()
+        );
+        let mut fleet = app.bus.fleet();
+        fleet.set_limits(&line.key, limits);
+        fleet.add_entry(
+            app.now(),
+            None,
+            protocol::Severity::Info,
+            "limit",
+            text,
+            Some(operator),
+        );
+        StatusCode::NO_CONTENT.into_response()
+    })
+    .await
+}
+
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SectorsRequest {

@@ -172,6 +172,26 @@ pub(super) async fn acknowledge(State(app): State<App>, Json(request): Json<Ackn
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
+pub(super) struct DismissRequest {
+    car: CarName,
+    operator: String,
+}
+
+/// Hides a car that is gone, for all pages.
+pub(super) async fn dismiss(State(app): State<App>, Json(request): Json<DismissRequest>) -> Response {
+    let DismissRequest { car, operator } = request;
+    if operator.len() > Command::MAX_OPERATOR {
+        return too_long();
+    }
+    if app.bus.fleet().dismiss(&car, app.now(), &operator) {
+        StatusCode::NO_CONTENT.into_response()
+    } else {
+        (StatusCode::CONFLICT, format!("{car} is connected")).into_response()
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct ReplayRequest {
     playing: Option<bool>,
     speed: Option<f64>,

@@ -8,11 +8,19 @@ use std::sync::Arc;
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
-use axum::response::{IntoResponse, Response};
+use axum::response::{Html, IntoResponse, Response};
 
 /// The page may only load from and connect to its own origin.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                       connect-src 'self'; frame-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
+
+/// Why a request without the token is rejected.
+const NO_TOKEN: &str = "the token is missing: see the terminal";
+/// Asks for the token.
+const ASK_FOR_TOKEN: &str = "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width\">\
+    <title>pit wall</title><body style=\"font:16px system-ui;margin:2rem\"><h1>pit wall</h1><p>This page needs the token that \
+    <code>pitwall</code> prints in its terminal. It is another one after each start.</p>\
+    <form><label>token <input name=\"token\" autofocus autocomplete=\"off\" size=\"36\"></label> <button>open</button></form></body></html>";
 
 /// Accepts requests of the page's own origin, and on a network only with the token.
 #[derive(Clone)]
@@ -58,9 +66,7 @@ impl Guard {
             return Err("another site's page");
         }
         match &self.token {
-            Some(token) if !knows(headers, request.uri().query(), token) => {
-                Err("the token is missing: see the terminal")
-            }
+            Some(token) if !knows(headers, request.uri().query(), token) => Err(NO_TOKEN),
             _ => Ok(()),
         }
     }
@@ -79,8 +85,13 @@ fn knows(headers: &HeaderMap, query: Option<&str>, token: &str) -> bool {
 
 /// Checks a request, and adds the security headers to its response.
 pub(super) async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
+    let request_path = request.uri().path().to_owned();
     let mut response = match guard.admits(&request) {
         Ok(()) => next.run(request).await,
+        // Whoever opens the page without the token, or with that of an earlier run, is asked for it.
+        Err(why) if why == NO_TOKEN && request_path == "/" => {
+            return (StatusCode::FORBIDDEN, Html(ASK_FOR_TOKEN)).into_response();
+        }
         Err(why) => return (StatusCode::FORBIDDEN, why).into_response(),
     };
     let headers = response.headers_mut();

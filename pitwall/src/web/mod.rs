@@ -14,7 +14,9 @@
 //! POST /acknowledge    {operator}: acknowledges every alarm so far
 //! GET  /analysis       laps, sectors and map faults of all cars; /analysis/lap?id=... the data of one lap
 //! POST /analysis/load  {file}: adds the laps of a recording; GET /analysis/files lists them
+//! POST /limits         {car, limits, operator}: sets the alarm limits on a track; GET /limits/<car>
 //! POST /sectors        {track, borders}: keeps the sectors of a track
+//! POST /dismiss        {car, operator}: hides a car that is gone, until it is back
 //! POST /replay         {"playing": bool, "speed": n, "at": s}, each optional; only in a replay
 //! POST /rerun          starts the data stream for the Rerun viewer and returns its URL, under /rerun/
 //! ```
@@ -162,11 +164,13 @@ impl Page {
                 stopping.clone(),
             ));
         }
+        let tracks = Tracks::new(&options.recordings);
+        tokio::spawn(watch_limits(bus.clone(), tracks.clone(), stopping.clone()));
         let app = App {
             bus,
             service,
             replay,
-            tracks: Tracks::new(&options.recordings),
+            tracks,
             sessions: Sessions::default(),
             recordings: Arc::new(options.recordings),
             address,
@@ -193,7 +197,10 @@ impl Page {
             .route("/analysis/lap", get(analysis::lap))
             .route("/analysis/files", get(analysis::files))
             .route("/analysis/load", post(analysis::load))
+            .route("/limits/{car}", get(analysis::limits))
+            .route("/limits", post(analysis::set_limits))
             .route("/sectors", post(analysis::keep_sectors))
+            .route("/dismiss", post(api::dismiss))
             .route("/replay", post(api::replay));
         #[cfg(feature = "rerun")]
         let router = router
@@ -223,6 +230,24 @@ impl Page {
         self.stop.send_replace(true);
         if let Ok(Err(error)) = self.server.await {
             tracing::warn!(%error, "the page's server");
+        }
+    }
+}
+
+/// Reads the engineer's limits of each track that a car appears on.
+async fn watch_limits(bus: Arc<EventBus>, tracks: Tracks, mut stopping: watch::Receiver<bool>) {
+    let mut ticks = tokio::time::interval(Duration::from_secs(1));
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => {}
+            _ = stopping.wait_for(|stop| *stop) => return,
+        }
+        let (bus, tracks) = (bus.clone(), tracks.clone());
+        if tokio::task::spawn_blocking(move || analysis::load_limits(&bus, &tracks))
+            .await
+            .is_err()
+        {
+            return;
         }
     }
 }

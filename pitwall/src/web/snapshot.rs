@@ -71,6 +71,8 @@ struct Hello {
     rerun: bool,
     /// The last two minutes of each car.
     history: BTreeMap<CarName, Vec<HealthSample>>,
+    /// The alarms that nobody has acknowledged, however old they are.
+    open: Vec<LogEntry>,
 }
 
 #[derive(Serialize)]
@@ -202,6 +204,7 @@ impl Snapshot {
         sent_state.log = fleet.log().last();
         let hello = anew.then(|| Hello {
             rerun: cfg!(feature = "rerun"),
+            open: fleet.log().open().cloned().collect(),
             history: fleet
                 .cars()
                 .map(|car| (car.name.clone(), car.history().copied().collect()))

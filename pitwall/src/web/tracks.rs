@@ -1,4 +1,4 @@
-//! What the engineer keeps with a track: its sectors. One small file for each track, beside the recordings.
+//! What the engineer keeps with a track: its sectors and alarm limits. One small file for each track, beside the recordings.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use serde::{Deserialize, Serialize};
 
 use crate::analysis::{Sectors, TrackLine};
+use crate::fleet::Limits;
 
 /// What is kept with a track.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -15,6 +16,9 @@ pub(super) struct TrackSettings {
     /// Its sectors; None for those of equal length.
     #[serde(default)]
     pub(super) sectors: Option<Sectors>,
+    /// The alarm limits of the engineer.
+    #[serde(default)]
+    pub(super) limits: Limits,
 }
 
 /// The settings of all tracks. Cheap to share.
@@ -64,14 +68,34 @@ impl Tracks {
         if let Some(sectors) = &settings.sectors {
             Sectors::new(sectors.borders().to_vec(), line.length).map_err(fault)?;
         }
+        Limits::new(settings.limits.to_map()).map_err(fault)?;
         Ok(settings)
     }
 
     /// Keeps the sectors of a track; the reason why not as `Err`.
     pub(super) fn keep_sectors(&self, line: &TrackLine, borders: Vec<f64>) -> Result<(), String> {
-        let settings = TrackSettings {
-            sectors: Some(Sectors::new(borders, line.length)?),
-        };
+        let sectors = Some(Sectors::new(borders, line.length)?);
+        self.keep(
+            line,
+            TrackSettings {
+                sectors,
+                ..self.of(line)
+            },
+        )
+    }
+
+    /// Keeps the alarm limits of a track; the reason why not as `Err`.
+    pub(super) fn keep_limits(&self, line: &TrackLine, limits: Limits) -> Result<(), String> {
+        self.keep(
+            line,
+            TrackSettings {
+                limits,
+                ..self.of(line)
+            },
+        )
+    }
+
+    fn keep(&self, line: &TrackLine, settings: TrackSettings) -> Result<(), String> {
         let path = self.path(line);
         let fault = |error: std::io::Error| format!("{}: {error}", path.display());
         std::fs::create_dir_all(&self.folder).map_err(fault)?;

@@ -154,7 +154,11 @@ export class Analysis {
     right.append(this.map, this.mapBar, sectorBox, make("h3", "", "What limited the laps"), this.advice, make("h3", "", "The map is wrong here"), this.findings);
     root.append(side, middle, right);
     this.listen();
-    new ResizeObserver(() => this.drawSoon()).observe(root);
+    new ResizeObserver(() => {
+      root.classList.toggle("an-two", root.clientWidth < 1250);
+      root.classList.toggle("an-one", root.clientWidth < 700);
+      this.drawSoon();
+    }).observe(root);
   }
 
   listen() {
@@ -469,7 +473,7 @@ export class Analysis {
     let [low, high] = [Infinity, -Infinity];
     for (const [, points] of lines) for (const [, v] of points) if (v === v) { low = Math.min(low, v); high = Math.max(high, v); }
     if (low > high) [low, high] = [0, 1];
-    const pad = Math.max((high - low) * 0.08, 1e-3);
+    const pad = Math.max((high - low) * 0.08, 3 * 10 ** -channel.digits);
     [low, high] = [low - pad, high + pad];
     const y = (v) => bottom - (v - low) / (high - low) * (bottom - top);
 

@@ -33,10 +33,24 @@ async function act(car, action, expected = null) {
   return result;
 }
 
+/// A set is tried for this long before the car falls back [ms].
+const TRIAL = 60e3;
+/// Commands of this page that can be undone, the newest last.
+const done = [];
+const sets = async (car, name, revision, revert_after_ms) => {
+  const before = snapshot?.cars.find((c) => c.car === car)?.set?.name;
+  const result = await act(car, { params: { select: { name, revert_after_ms } } }, revision);
+  if (result.done && before !== name) done.push({ car, what: `set ${name}`, undo: () => act(car, { params: "revert" }) });
+  return result;
+};
 const acts = {
   select,
-  choose: (car, name, revision) => act(car, { params: { select: { name, revert_after_ms: null } } }, revision),
+  choose: (car, name, revision) => sets(car, name, revision, null),
+  trial: (car, name, revision) => sets(car, name, revision, TRIAL),
+  confirm: (car) => act(car, { params: "confirm" }),
+  revert: (car) => act(car, { params: "revert" }),
   record: (car, on) => act(car, { record: on ? "start" : "stop" }),
+  dismiss: (car) => post("/dismiss", { car, operator: operator.value }),
   shadow: (car, name) => act(car, { params: { shadow: { name: name ?? null } } }),
   search,
   open: (car) => { select(car); large(true); },
@@ -46,7 +60,7 @@ const cards = new Cards($("cars"), acts);
 const big = new Large($("large"), acts);
 const track = new Track($("map"), placed, picked);
 const sound = new Sound($("sound"));
-const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"), sound);
+const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"), sound, $("spoken"));
 const link = connect(take, ({ up, silent_s: silent, rate }) => {
   const badge = $("link");
   badge.textContent = up ? (snapshot?.replay ? "replay" : "live") : `no news for ${lasting(silent)}: the pit wall does not answer`;
@@ -55,6 +69,11 @@ const link = connect(take, ({ up, silent_s: silent, rate }) => {
   document.body.classList.toggle("cut", !up);
   const late = [...ages].sort((a, b) => a - b);
   pace = `${fixed(rate, 0)} snapshots /s; drawn after ${fixed(late[late.length >> 1], 0)} ms, p99 ${fixed(late[Math.floor(late.length * 0.99)], 0)} ms`;
+  showWorst(up);
+}, () => { if (!$("token").open) $("token").showModal(); });
+$("token").addEventListener("close", () => {
+  const value = $("token-value").value.trim();
+  if (value) location.href = `/?token=${encodeURIComponent(value)}`;
 });
 link.operator(operator.value);
 operator.addEventListener("change", () => {
@@ -63,6 +82,48 @@ operator.addEventListener("change", () => {
   link.operator(operator.value);
 });
 
+/// Asks before something is changed. `answers` are [text, act]; the last button cancels.
+function ask(text, ...answers) {
+  const box = $("ask");
+  $("ask-text").textContent = text;
+  $("ask-answers").replaceChildren(...[...answers, ["cancel (Esc)", () => {}]].map(([label, act]) => {
+    const button = element("button", "", label);
+    button.addEventListener("click", () => { box.close(); act(); });
+    return button;
+  }));
+  box.showModal();
+  $("ask-answers").firstChild.focus();
+}
+
+/// The browser's title and icon show the worst state of all cars.
+const WORST = ["LOST", "STALE", "BLIND", "UNKNOWN", "RELOCALIZING", "DEGRADED", "CONVERGING", "INIT", "LOCALIZED"];
+let worstShown = "";
+function showWorst(up) {
+  const cars = snapshot?.cars ?? [];
+  const worst = WORST.find((state) => cars.some((car) => car.state === state));
+  const names = cars.filter((car) => car.state === worst).map((car) => car.car);
+  const [shape, colour] = up ? STATES[worst] ?? ["", "none"] : ["✖", "none"];
+  const text = !up ? "✖ no news · pit wall" : !worst ? "pit wall" : worst === "LOCALIZED" ? `${shape} ${cars.length} localized · pit wall` : `${shape} ${worst} ${names.slice(0, 2).join(", ")}${names.length > 2 ? " …" : ""} · pit wall`;
+  if (text === worstShown) return;
+  worstShown = text;
+  document.title = text;
+  const svg = `<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><circle cx="8" cy="8" r="7" fill="${palette()[colour]}" stroke="#888"/></svg>`;
+  document.querySelector("link[rel=icon]").href = `data:image/svg+xml,${encodeURIComponent(svg)}`;
+}
+
+/// Undoes the last command that this page gave.
+function undo() {
+  const last = done.at(-1);
+  if (!last) {
+    $("hint").textContent = "no command of this page to undo";
+    return;
+  }
+  ask(`Undo ${last.what} on ${last.car}?`, ["undo (Enter)", async () => {
+    const result = await last.undo();
+    if (result?.done) done.splice(done.indexOf(last), 1);
+  }]);
+}
+
 function take(next) {
   snapshot = next;
   const first = next.epoch !== epoch || Boolean(next.hello);
@@ -70,8 +131,8 @@ function take(next) {
     epoch = next.epoch;
     log.restart();
     track.restart();
-    cards.keep(next.cars.map((car) => car.car));
   }
+  cards.keep(next.cars.map((car) => car.car));
   $("empty").hidden = next.cars.length > 0;
   if ((!selected || (first && !next.cars.some((car) => car.car === selected))) && next.cars.length) select(next.cars[0].car);
   cards.update(next.cars, selected, next.now / 1e9);
@@ -80,7 +141,7 @@ function take(next) {
     $("rerun").hidden = !next.hello.rerun;
   }
   track.update(next, selected);
-  log.add(next.log, next.acknowledged, first);
+  log.add(next.log, next.acknowledged, first, next.hello?.open ?? []);
   if (next.recording) failed = false;
   else if (next.log.some((entry) => entry.kind === "recorder" && entry.severity === "critical")) failed = true;
   showRecording(next);
@@ -152,8 +213,12 @@ function showRecording({ recording, disk_free: free, replay }) {
   if ($("recording").title !== full) $("recording").title = full;
 }
 
-async function record() {
-  const on = !snapshot?.recording;
+function record() {
+  if (snapshot?.recording) ask("Stop the recording?", ["stop it (Enter)", () => setRecording(false)]);
+  else setRecording(true);
+}
+
+async function setRecording(on) {
   $("record").disabled = true;
   ending = !on;
   const { ok, body } = await post("/record", { on, operator: operator.value });
@@ -204,7 +269,25 @@ function place(on) {
 
 async function placed(x, y, heading) {
   place(false);
-  await act(selected, { pose: { x, y, heading } });
+  const car = selected;
+  const before = snapshot?.cars.find((c) => c.car === car)?.pose;
+  const result = await act(car, { pose: { x, y, heading } });
+  if (!result.done) return;
+  cards.outcome(car, { done: true, text: `pose set to ${fixed(x, 2)}, ${fixed(y, 2)} m, ${fixed(heading * 180 / Math.PI, 0)}°${before ? `: ${fixed(Math.hypot(x - before.x_m, y - before.y_m), 2)} m from the estimate before` : ""}` });
+  if (before) rememberPose(car, before);
+}
+
+/// A pose can be given back only while the car stands where it stood.
+function rememberPose(car, { x_m: x, y_m: y, heading_rad: heading }) {
+  done.push({
+    car, what: `the pose (back to ${fixed(x, 2)}, ${fixed(y, 2)} m)`,
+    undo: async () => {
+      const speed = snapshot?.cars.find((c) => c.car === car)?.pose?.speed_mps ?? 0;
+      if (speed < 0.3) return act(car, { pose: { x, y, heading } });
+      cards.outcome(car, { done: false, text: "the car drives: its pose before is old. Search the map instead (g)" });
+      return null;
+    },
+  });
 }
 
 /// Shows the candidates on the track and as buttons. Scores only compare candidates with each other.
@@ -234,8 +317,13 @@ async function search(car = selected) {
   if (!car) return;
   select(car);
   const result = await act(car, { relocalize: "search" });
-  const reply = result.verdict?.answer?.outcome?.done?.reply;
-  if (selected === car) offer(reply?.candidates ?? []);
+  const candidates = result.verdict?.answer?.outcome?.done?.reply?.candidates ?? [];
+  if (result.done) {
+    const best = candidates.reduce((a, c) => (a && a.score >= c.score ? a : c), null);
+    const found = best ? `${candidates.length} ${candidates.length === 1 ? "place fits" : "places fit"}: number ${best.number} at ${fixed(best.pose.x, 1)}, ${fixed(best.pose.y, 1)} m fits best` : "the search has begun; no place fits yet";
+    cards.outcome(car, { done: true, text: found });
+  }
+  if (selected === car) offer(candidates);
 }
 
 async function picked(candidate) {
@@ -266,6 +354,7 @@ function paint() {
 function large(on = $("large").hidden) {
   $("large").hidden = !on || !selected;
   if (!on) $("map").focus();
+  else $("large").scrollIntoView({ block: "nearest" });
 }
 
 function shadow() {
@@ -361,6 +450,7 @@ const TABS = ["log", "laps", "numbers", "analysis"];
 const tab = (shown) => {
   for (const other of TABS) {
     $(`tab-${other}`).setAttribute("aria-selected", String(other === shown));
+    $(`tab-${other}`).tabIndex = other === shown ? 0 : -1;
     $(`${other}-panel`).hidden = other !== shown;
   }
   // The plots need the room of the track.
@@ -368,7 +458,56 @@ const tab = (shown) => {
   if (shown === "analysis") showAnalysis(snapshot);
 };
 for (const name of TABS) $(`tab-${name}`).addEventListener("click", () => tab(name));
+document.querySelector("[role=tablist]").addEventListener("keydown", (event) => {
+  const at = TABS.findIndex((name) => event.target.id === `tab-${name}`);
+  const next = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: TABS.length - 1 }[event.key];
+  if (at < 0 || next === undefined) return;
+  const name = TABS[(next + TABS.length) % TABS.length];
+  tab(name);
+  $(`tab-${name}`).focus();
+  event.preventDefault();
+  event.stopPropagation();
+});
+for (const name of TABS.slice(1)) $(`tab-${name}`).tabIndex = -1;
 for (const [word, [shape, , meaning]] of Object.entries(STATES)) $("legend").append(element("li", "", `${shape} ${word}: ${meaning}`));
+
+/// The engineer's alarm limits on the track of the selected car.
+async function editLimits() {
+  if (!selected) return;
+  const response = await fetch(`/limits/${selected}`).catch(() => null);
+  if (!response?.ok) return;
+  const { limits, channels } = await response.json();
+  $("limits-fault").textContent = limits ? "" : `${selected} has no track with a raceline`;
+  $("limits-table").replaceChildren(...channels.filter((c) => c.worse !== "neither").map((c) => {
+    const row = element("tr");
+    const input = element("input");
+    input.type = "number";
+    input.step = "any";
+    input.name = c.name;
+    input.dataset.factor = c.factor;
+    input.id = `limit-${c.name}`;
+    const limit = limits?.[c.name];
+    input.value = limit === undefined ? "" : Number((limit * c.factor).toPrecision(6));
+    const label = element("label", "", `${c.label} ${{ low: "below", high: "above", far: "beyond ±" }[c.worse]}`);
+    label.htmlFor = input.id;
+    const [name, value] = [element("td"), element("td")];
+    name.append(label);
+    value.append(input, ` ${c.unit}`);
+    row.append(name, value);
+    return row;
+  }));
+  $("limits").returnValue = "";
+  $("limits").showModal();
+}
+$("limits").addEventListener("close", async () => {
+  if ($("limits").returnValue !== "ok") return;
+  const limits = {};
+  for (const input of $("limits-table").querySelectorAll("input")) {
+    if (input.value !== "") limits[input.name] = Number(input.value) / Number(input.dataset.factor);
+  }
+  const { ok, body } = await post("/limits", { car: selected, limits, operator: operator.value });
+  if (!ok) $("hint").textContent = body;
+});
 
 const acknowledge = () => post("/acknowledge", { operator: operator.value });
 const fit = () => { follow(false); track.fit(); };
@@ -377,7 +516,7 @@ const sessions = new SessionDialog($("sessions"), { words: $("sessions-words"), 
 const showSessions = () => sessions.open();
 const CLICKS = {
   record, theme: otherTheme, "help-button": help, "sessions-button": showSessions, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
-  mark, rerun, acknowledge, alarm: acknowledge, sound: () => sound.toggle(),
+  mark, rerun, acknowledge, alarm: acknowledge, "limits-button": editLimits, sound: () => sound.toggle(),
 };
 for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
 
@@ -388,13 +527,22 @@ const step = (by) => {
   select(car.car);
   document.querySelector(`.card[data-car="${car.car}"]`)?.scrollIntoView({ block: "nearest" });
 };
+const askForSet = (name) => {
+  const car = snapshot?.cars.find((c) => c.car === selected);
+  if (!car?.set || car.set.name === name) return;
+  ask(`Put set ${name} in force on ${selected}? ${car.set.name} is in force.`,
+    [`put ${name} in force (Enter)`, () => acts.choose(selected, name, car.set.revision)],
+    ["try it for 60 s, then fall back", () => acts.trial(selected, name, car.set.revision)]);
+};
 const KEYS = {
-  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), g: () => search(), m: mark, p: paint, s: shadow, o: () => large(),
+  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), m: mark, z: undo,
+  g: () => selected && ask(`Search the whole map for ${selected}? It gives up its pose meanwhile.`, ["search (Enter)", () => search()]),
+  x: () => selected && ask(`Go back to the set before on ${selected}?`, ["go back (Enter)", () => acts.revert(selected)]), p: paint, s: shadow, o: () => large(),
   v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,
   e: () => tab("log"), l: () => tab("laps"), u: () => tab("numbers"), d: () => tab("analysis"),
   "+": () => track.zoom(1.3), "=": () => track.zoom(1.3), "-": () => track.zoom(1 / 1.3),
   c: () => selected && act(selected, { params: "confirm" }),
-  H: () => cards.cards.get(selected)?.choose("hq"), L: () => cards.cards.get(selected)?.choose("lq"),
+  H: () => askForSet("hq"), L: () => askForSet("lq"),
   ArrowDown: () => step(1), ArrowUp: () => step(-1),
   ",": () => skip(-5), ".": () => skip(5),
   Escape: () => { place(false); offer([]); large(false); },
@@ -416,4 +564,4 @@ addEventListener("keydown", (event) => {
 });
 
 // The page's state, for measurements and tests.
-window.pitwall = { ages, toCanvas: (x, y) => track.toCanvas(x, y), get selected() { return selected; }, get snapshot() { return snapshot; } };
+window.pitwall = { ages, toCanvas: (x, y) => track.toCanvas(x, y), get selected() { return selected; }, get analysis() { return analysis; }, get snapshot() { return snapshot; } };

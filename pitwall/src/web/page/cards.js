@@ -99,9 +99,9 @@ export const verdict = (shadow) => {
 const READABLE = 190;
 
 /// Heights of a card [px]: whole, and with less on it.
-const WHOLE = 234, TIGHT = 190;
+const WHOLE = 282, TIGHT = 226;
 
-/// All cards. `acts` gives commands: choose(car, set), shadow(car, set or null), search(car), open(car), select(car).
+/// All cards. `acts` gives commands: choose(car, set), trial(car, set), revert(car), confirm(car), dismiss(car), shadow(car, set or null), search(car), open(car), select(car).
 export class Cards {
   constructor(root, acts) {
     this.root = root;
@@ -171,7 +171,10 @@ class Card {
     this.state = element("span", "state");
     const open = this.button("⤢", "open this car large (o)", () => acts.open(name));
     open.className = "open";
-    head.append(this.chip, element("span", "name", name), this.state, this.since, open);
+    this.dismiss = this.button("✕", "hide this car, which is gone, until it is back", () => acts.dismiss(name));
+    this.dismiss.className = "open";
+    this.dismiss.hidden = true;
+    head.append(this.chip, element("span", "name", name), this.state, this.since, this.dismiss, open);
     this.causes = element("div", "causes");
     this.brief = element("div", "brief");
     const detail = element("div", "detail");
@@ -195,7 +198,10 @@ class Card {
       if (this.car) acts.shadow(name, this.car.shadow ? null : otherSet(this.car));
     });
     this.find = this.button("find", "start a global search (g)", () => acts.search(name));
-    note.append(this.note, this.shadow, this.find);
+    this.trial = this.button("try", "try the other set for 60 s; the car falls back unless it is confirmed", () => acts.trial(name, otherSet(this.car), this.revision));
+    this.confirm = this.button("confirm", "keep the set in force (c)", () => acts.confirm(name));
+    this.revert = this.button("back", "go back to the set before (x)", () => acts.revert(name));
+    note.append(this.note, this.trial, this.confirm, this.revert, this.shadow, this.find);
     detail.append(facts, this.spark, this.sets, note);
     this.root.append(head, this.causes, this.brief, detail);
   }
@@ -213,6 +219,7 @@ class Card {
   update(car, index, selected, read) {
     this.car = car;
     const [shape, colour] = STATES[car.state] ?? ["?", "none"];
+    if (this.dismiss.hidden !== car.alive) this.dismiss.hidden = car.alive;
     const className = `card ${colour}${car.blind ? " blind" : ""}${selected ? " selected" : ""}`;
     const changed = this.root.className !== className;
     if (changed) this.root.className = className;
@@ -269,6 +276,10 @@ class Card {
   updateNote(car) {
     setText(this.shadow, car.shadow ? "■ shadow" : "shadow");
     const set = car.set;
+    const other = otherSet(car);
+    this.trial.hidden = !other || Boolean(set?.reverts_to);
+    if (other) setText(this.trial, `try ${other} 60 s`);
+    this.confirm.hidden = !set?.reverts_to;
     const answer = this.outcomeShown && (this.outcomeShown.done !== true || performance.now() - this.outcomeShown.at < 8000) ? this.outcomeShown : null;
     let [kind, text] = ["", set ? `${set.name} revision ${set.revision} by ${set.who}` : ""];
     if (car.health?.auto) text += "; switches by itself";

@@ -5,7 +5,7 @@ const SILENT = 1000;
 
 /// Calls `onSnapshot` for each snapshot, and `onLink` with the state of the connection twice a second and at each
 /// change: {up, silent_s, rate}. Reconnects for ever.
-export function connect(onSnapshot, onLink) {
+export function connect(onSnapshot, onLink, onRefused) {
   let socket = null;
   let settings = { select: null, operator: null };
   let retry = 200;
@@ -31,6 +31,7 @@ export function connect(onSnapshot, onLink) {
       onSnapshot(snapshot);
     };
     socket.onclose = () => {
+      if (!open) fetch("/snapshot").then((r) => r.status === 403 && onRefused()).catch(() => {});
       open = false;
       report();
       setTimeout(dial, retry);

@@ -104,7 +104,7 @@ export class Large {
 
   updateSets(car) {
     const set = car.set;
-    const key = JSON.stringify([car.car, set?.name, set?.revision, set?.available, car.shadow?.set]);
+    const key = JSON.stringify([car.car, set?.reverts_to, set?.name, set?.revision, set?.available, car.shadow?.set]);
     if (this.sets.dataset.key === key) return;
     this.sets.dataset.key = key;
     const button = (text, act) => {
@@ -118,9 +118,11 @@ export class Large {
       const row = element("tr", name === set.name ? "force" : "");
       row.append(element("td", "", name));
       if (name === set.name) {
-        row.append(element("td", "", `in force, revision ${set.revision}, by ${set.who}`));
+        row.append(element("td", "", `in force, revision ${set.revision}, by ${set.who}`), button("back to the one before", () => this.acts.revert(car.car)));
+        if (set.reverts_to) row.append(button("confirm", () => this.acts.confirm(car.car)));
       } else {
         row.append(button("put in force", () => this.acts.choose(car.car, name, set.revision)));
+        row.append(button("try for 60 s", () => this.acts.trial(car.car, name, set.revision)));
         const runs = car.shadow?.set === name;
         row.append(button(runs ? "end the shadow" : "run in the shadow", () => this.acts.shadow(car.car, runs ? null : name)));
       }

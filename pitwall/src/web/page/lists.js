@@ -7,7 +7,8 @@ const LONGEST = 500;
 
 /// The list of events, with alarms that stay until somebody acknowledges them, on whichever page.
 export class Log {
-  constructor(list, alarm, filterCar, filterSeverity, sound) {
+  constructor(list, alarm, filterCar, filterSeverity, sound, spoken) {
+    this.spoken = spoken;
     this.list = list;
     this.alarm = alarm;
     this.filterCar = filterCar;
@@ -19,7 +20,8 @@ export class Log {
   }
 
   /// Adds new entries. Those up to number `acknowledged` are no longer alarms.
-  add(entries, acknowledged, first) {
+  add(entries, acknowledged, first, open = []) {
+    if (first) entries = [...open.filter((entry) => !entries.some((other) => other.number === entry.number)), ...entries];
     if (acknowledged !== this.acknowledged) {
       this.acknowledged = acknowledged;
       for (const line of this.list.querySelectorAll("li.open")) {
@@ -31,17 +33,25 @@ export class Log {
       if (entry.number <= this.last) continue;
       this.last = entry.number;
       this.entries.push(entry);
-      if (this.entries.length > LONGEST) this.entries.shift();
+      // The oldest that is no open alarm goes.
+      if (this.entries.length > LONGEST) this.entries.splice(Math.max(this.entries.findIndex((other) => !this.open(other)), 0), 1);
       alarm ||= !first && this.open(entry);
       if (this.wanted(entry)) this.show(entry);
     }
-    while (this.list.children.length > LONGEST) this.list.lastChild.remove();
-    if (alarm) this.sound.alarm();
-    const open = this.entries.filter((entry) => this.open(entry)).length;
-    if (open !== this.count) {
-      this.count = open;
-      this.alarm.hidden = open === 0;
-      this.alarm.textContent = open === 1 ? "1 alarm" : `${open} alarms`;
+    for (let line = this.list.lastChild; line && this.list.children.length > LONGEST;) {
+      const before = line.previousSibling;
+      if (!line.classList.contains("open")) line.remove();
+      line = before;
+    }
+    if (alarm) {
+      this.sound.alarm();
+      this.spoken.textContent = this.text(entries.findLast((entry) => this.open(entry)));
+    }
+    const count = this.entries.filter((entry) => this.open(entry)).length;
+    if (count !== this.count) {
+      this.count = count;
+      this.alarm.hidden = count === 0;
+      this.alarm.textContent = count === 1 ? "1 alarm" : `${count} alarms`;
     }
   }
 

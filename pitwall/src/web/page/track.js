@@ -382,12 +382,16 @@ export class Track {
     context.globalAlpha = 1;
   }
 
-  /// Names beside the cars, one below the other where cars are close.
+  /// Names beside the cars.
   drawNames(context, colour) {
     const placed = [];
     context.lineWidth = 4;
     context.strokeStyle = colour.ground;
-    this.snapshot.cars.forEach((car, index) => {
+    // The selected car and those in trouble first, so that their names have room.
+    const order = this.snapshot.cars.map((car, index) => [car, index]);
+    const rank = (car) => (car.car === this.selected ? 0 : car.state === "LOCALIZED" ? 2 : 1);
+    order.sort(([a], [b]) => rank(a) - rank(b));
+    order.forEach(([car, index]) => {
       if (!car.pose) return;
       const [px, py] = this.toCanvas(car.pose.x_m, car.pose.y_m);
       const chosen = car.car === this.selected;
@@ -397,8 +401,10 @@ export class Track {
       const width = context.measureText(label).width;
       // To the left of a car at the right edge.
       const x = px + 14 + width > this.canvas.clientWidth ? px - 14 - width : px + 14;
-      let y = py - 10;
-      while (placed.some((other) => Math.abs(other.y - y) < 15 && x < other.x + other.width + 4 && other.x < x + width + 4)) y -= 15;
+      // Beside the car, or a little higher or lower. Where there is no room, the name is left out: it is on the card.
+      const free = (at) => !placed.some((other) => Math.abs(other.y - at) < 15 && x < other.x + other.width + 4 && other.x < x + width + 4);
+      const y = [py - 10, py + 18, py - 25, py + 33].find(free) ?? (chosen ? py - 10 : null);
+      if (y === null) return;
       placed.push({ x, y, width });
       context.strokeText(label, x, y);
       context.fillStyle = car.blind ? colour.none : colour.text;

@@ -164,6 +164,12 @@ impl State {
             if let Some(info) = &car.info {
                 push(EventPayload::Info(info.clone()));
             }
+            if let Some((who, text)) = &car.run_sheet {
+                push(EventPayload::Marker {
+                    who: who.clone(),
+                    text: text.clone(),
+                });
+            }
             if let Some((offset, round_trip)) = car.clock() {
                 push(EventPayload::Clock { offset, round_trip });
             }

@@ -385,6 +385,45 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
         .collect();
     assert_eq!(markers, ["ana: rain at turn two"]);
 
+    // The run sheet is shown with the car.
+    browser.key("w").await;
+    browser
+        .wait("the dialog", "document.getElementById('sheet').open")
+        .await;
+    browser.fill("#sheet-tyre", "taped").await;
+    browser
+        .wait(
+            "the run sheet is in the log",
+            &logged("run sheet: tyre: taped [ana]"),
+        )
+        .await;
+    browser
+        .wait(
+            "it is with the car",
+            "pitwall.snapshot.cars[0].run_sheet === 'tyre: taped'",
+        )
+        .await;
+
+    // A limit of one's own raises an alarm, and is kept with the track.
+    browser.click("#tab-log").await;
+    browser.click("#limits-button").await;
+    browser
+        .wait("the dialog", "document.getElementById('limits').open")
+        .await;
+    browser.fill("#limit-alignment", "95").await;
+    browser
+        .wait(
+            "an alarm",
+            &logged("car-1 alignment 90.0 % beyond the limit of 95.0 % at s ="),
+        )
+        .await;
+    assert_eq!(
+        std::fs::read_dir(bench.recordings.path().join("tracks"))
+            .expect("a folder of tracks")
+            .count(),
+        1
+    );
+
     // The large view, the help and every tab open without an error.
     for key in ["o", "p", "u", "Escape", "f", "0", "e", "ArrowDown", "ArrowUp"] {
         browser.key(key).await;
@@ -397,6 +436,16 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
         )
         .await;
     browser.screenshot("page-large").await;
+    browser
+        .evaluate("((list) => { list.value = 'mute'; list.dispatchEvent(new Event('change')); })(document.querySelector('#large select'))")
+        .await;
+    browser
+        .wait(
+            "two cars side by side",
+            "document.querySelector('#large-2 .headline')?.innerText.includes('mute')",
+        )
+        .await;
+    browser.screenshot("page-large-two").await;
     browser.key("Escape").await;
     browser.expect_clean(bench.server.url()).await;
 

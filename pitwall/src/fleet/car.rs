@@ -35,6 +35,8 @@ pub struct Car {
     pub(crate) blind_logged: bool,
     /// True while an operator has hidden it, because it is gone.
     pub(crate) dismissed: bool,
+    /// The run sheet of its heat: operator and text.
+    pub run_sheet: Option<(Arc<str>, Arc<str>)>,
     /// True when the log has an entry that health messages no longer come, until they do.
     pub(crate) stale_logged: bool,
     /// When a message of a second sender of this name was last dropped \[unix ns\].
@@ -80,6 +82,8 @@ impl Car {
     pub const STALE_AFTER: i64 = 1_500_000_000;
     /// A car of which no second sender is noticed for this long is the only one \[ns\].
     const ALONE_AFTER: i64 = 3_000_000_000;
+    /// Start of a marker that is a run sheet.
+    pub const RUN_SHEET: &str = "run sheet: ";
     /// A connected car that is silent for less than this has a starved link. After that, it is silent on purpose \[s\].
     const STARVED_AT_MOST: f64 = 10.0;
 
@@ -92,6 +96,7 @@ impl Car {
             last_heard: at,
             blind_logged: false,
             dismissed: false,
+            run_sheet: None,
             stale_logged: false,
             two_senders: None,
             pose: None,

@@ -54,6 +54,8 @@ pub struct CarView {
     pub last_lap_s: Option<f64>,
     /// The best lap \[s\].
     pub best_lap_s: Option<f64>,
+    /// The run sheet of its heat.
+    pub run_sheet: Option<String>,
     /// The software on the car.
     pub info: Option<CarInfo>,
 }
@@ -157,6 +159,10 @@ impl Car {
             coverage: (sent > 0).then(|| 1.0 - (missing as f64 / sent as f64).min(1.0)),
             last_lap_s: self.laps().last().map(|lap| lap.time_s),
             best_lap_s: best,
+            run_sheet: self
+                .run_sheet
+                .as_ref()
+                .map(|(_, text)| text.trim_start_matches(Self::RUN_SHEET).to_owned()),
             info: self.info.clone(),
         }
     }

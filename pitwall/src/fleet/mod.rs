@@ -123,6 +123,9 @@ impl Fleet {
             EventPayload::Map { map, bytes } => car.set_map(Arc::clone(map), Arc::clone(bytes)),
             EventPayload::Info(info) => car.info = Some(info.clone()),
             EventPayload::Marker { who, text } => {
+                if text.starts_with(Car::RUN_SHEET) {
+                    car.run_sheet = Some((Arc::clone(who), Arc::clone(text)));
+                }
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
                 self.add_entry(at, car, Severity::Info, "marker", text, who);
             }

@@ -12,6 +12,7 @@ use serde_json::json;
 
 use super::App;
 use crate::clock::unix_now;
+use crate::fleet::Car;
 use crate::network::{REPLY_TIMEOUT, new_command_id};
 use crate::recording::RecorderOptions;
 
@@ -136,12 +137,29 @@ pub(super) struct MarkRequest {
     car: CarName,
     operator: String,
     text: String,
+    /// The note is about this time up to now \[s\].
+    #[serde(default)]
+    for_s: Option<f64>,
+    /// True for the run sheet of the car's heat, which is shown with the car and begins every recording.
+    #[serde(default)]
+    run_sheet: bool,
 }
 
 /// Marks this moment in the log and the recording.
 pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest>) -> Response {
     const LONGEST: usize = 500;
-    let MarkRequest { car, operator, text } = request;
+    let MarkRequest {
+        car,
+        operator,
+        text,
+        for_s,
+        run_sheet,
+    } = request;
+    let text = match for_s {
+        _ if run_sheet => format!("{}{text}", Car::RUN_SHEET),
+        Some(for_s) if for_s.is_finite() && for_s > 0.0 => format!("over the last {for_s:.0} s: {text}"),
+        _ => text,
+    };
     let Some(service) = &app.service else {
         return in_a_replay();
     };

@@ -10,7 +10,7 @@
 //! GET  /sessions?text= the recordings in the folder with these words
 //! POST /sessions/open  {file}: opens one for replay on a page of its own and returns its URL
 //! POST /record         {"on": true|false, "operator"}
-//! POST /mark           {car, operator, text}
+//! POST /mark           {car, operator, text, for_s, run_sheet}: a note on this moment or the time before it, or a run sheet
 //! POST /acknowledge    {operator}: acknowledges every alarm so far
 //! GET  /analysis       laps, sectors and map faults of all cars; /analysis/lap?id=... the data of one lap
 //! POST /analysis/load  {file}: adds the laps of a recording; GET /analysis/files lists them

@@ -155,7 +155,7 @@ export class Analysis {
     root.append(side, middle, right);
     this.listen();
     new ResizeObserver(() => {
-      root.classList.toggle("an-two", root.clientWidth < 1250);
+      root.classList.toggle("an-two", root.clientWidth < 1100);
       root.classList.toggle("an-one", root.clientWidth < 700);
       this.drawSoon();
     }).observe(root);
@@ -381,7 +381,7 @@ export class Analysis {
     }
     const track = this.trackOf();
     const none = !track ? "No track with a raceline yet." : !this.view.laps.length ? "No lap has been driven yet." : "";
-    const text = none || (this.chosen.length ? "move: cursor · click: hold it · Shift+click: second cursor · drag or wheel: zoom" : "choose laps on the left");
+    const text = none || (this.chosen.length ? "move: cursor · click: hold it · Shift+click: second cursor · drag or wheel: zoom" : "choose laps in the list");
     if (this.hint.textContent !== text) this.hint.textContent = text;
     if (!track) return;
     if (laps) {
@@ -795,7 +795,7 @@ export class Analysis {
       this.heatMetric.value = this.metric;
       this.heatMetric.addEventListener("change", () => { this.metric = this.heatMetric.value; this.draw(true); });
       this.legend = make("canvas", "an-legend");
-      this.heatBar.append(this.heatMetric, this.legend, make("span", "an-hint", "laps of the list on the left, the newest at the top; a dot marks causes"), button("PNG", "save the picture", () => save("health.png", this.heat.toDataURL("image/png"))), button("CSV", "save the data", () => this.saveHeatData()));
+      this.heatBar.append(this.heatMetric, this.legend, make("span", "an-hint", "laps of the list, the newest at the top; a line marks causes"), button("PNG", "save the picture", () => save("health.png", this.heat.toDataURL("image/png"))), button("CSV", "save the data", () => this.saveHeatData()));
     }
     const channel = this.view.channels.find((c) => c.name === this.metric);
     const rows = this.view.laps.filter((lap) => lap.track === track.key && (!this.filter.value || `${lap.session}/${lap.car}` === this.filter.value))

@@ -57,7 +57,16 @@ const acts = {
   close: () => large(false),
 };
 const cards = new Cards($("cars"), acts);
-const big = new Large($("large"), acts);
+const big = new Large($("large"), { ...acts, beside, cars: () => snapshot?.cars.map(({ car }) => car) ?? [] });
+/// The car that is shown beside the large one.
+let second = null;
+const bigBeside = new Large($("large-2"), { ...acts, close: () => beside(null) });
+function beside(car) {
+  second = car;
+  $("large-2").hidden = !car || $("large").hidden;
+  if (car) $("large").dataset.half = "";
+  else delete $("large").dataset.half;
+}
 const track = new Track($("map"), placed, picked);
 const sound = new Sound($("sound"));
 const log = new Log($("log"), $("alarm"), $("filter-car"), $("filter-severity"), sound, $("spoken"));
@@ -163,6 +172,8 @@ function take(next) {
   if (!$("numbers-panel").hidden) showNumbers($("numbers"), next.cars[index], pace);
   if (!$("large").hidden && index >= 0) big.update(next.cars[index], index, cards.history(selected), next.now / 1e9);
   showAnalysis(next);
+  const other = next.cars.findIndex((car) => car.car === second);
+  if (!$("large-2").hidden && other >= 0) bigBeside.update(next.cars[other], other, cards.history(second), next.now / 1e9);
   // After this frame is drawn.
   requestAnimationFrame(() => {
     link.drawn(next.number);
@@ -247,7 +258,7 @@ function showReplay(replay) {
     if (!speeds.includes(String(replay.speed))) $("speed").append(new Option(replay.speed));
     $("speed").value = String(replay.speed);
   }
-  for (const id of ["place", "search", "mark"]) $(id).disabled = true;
+  for (const id of ["place", "search", "mark", "sheet-button"]) $(id).disabled = true;
 }
 const setPlayback = (change) => snapshot?.replay && post("/replay", change);
 const playPause = () => setPlayback({ playing: !snapshot.replay.playing });
@@ -353,6 +364,7 @@ function paint() {
 
 function large(on = $("large").hidden) {
   $("large").hidden = !on || !selected;
+  beside(on ? second : null);
   if (!on) $("map").focus();
   else $("large").scrollIntoView({ block: "nearest" });
 }
@@ -370,7 +382,27 @@ function mark() {
 }
 $("marker").addEventListener("close", () => {
   const text = $("marker-text").value.trim();
-  if ($("marker").returnValue === "ok" && text) post("/mark", { car: selected, operator: operator.value, text });
+  const range = $("marker-range").value;
+  const lap = snapshot?.cars.find(({ car }) => car === selected)?.last_lap_s;
+  const for_s = range === "lap" ? lap ?? null : range ? Number(range) : null;
+  if ($("marker").returnValue === "ok" && text) post("/mark", { car: selected, operator: operator.value, text, for_s });
+});
+
+/// The run sheet of the selected car.
+const SHEET = ["heat", "tyre", "battery", "notes"];
+function sheet() {
+  if (!selected || snapshot?.replay) return;
+  const known = Object.fromEntries((snapshot?.cars.find(({ car }) => car === selected)?.run_sheet ?? "").split("; ").map((part) => part.split(": ")));
+  for (const field of SHEET) $(`sheet-${field}`).value = known[field] ?? "";
+  $("sheet-title").textContent = `Run sheet of ${selected}`;
+  $("sheet").returnValue = "";
+  $("sheet").showModal();
+}
+$("sheet").addEventListener("close", () => {
+  const parts = SHEET.map((field) => [field, $(`sheet-${field}`).value.trim().replaceAll("; ", ", ")]).filter(([, value]) => value);
+  if ($("sheet").returnValue === "ok" && parts.length) {
+    post("/mark", { car: selected, operator: operator.value, text: parts.map(([field, value]) => `${field}: ${value}`).join("; "), run_sheet: true });
+  }
 });
 
 /// Shows the Rerun viewer instead of the track, or removes it with all its resources.
@@ -516,7 +548,7 @@ const sessions = new SessionDialog($("sessions"), { words: $("sessions-words"), 
 const showSessions = () => sessions.open();
 const CLICKS = {
   record, theme: otherTheme, "help-button": help, "sessions-button": showSessions, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
-  mark, rerun, acknowledge, alarm: acknowledge, "limits-button": editLimits, sound: () => sound.toggle(),
+  mark, rerun, acknowledge, alarm: acknowledge, "limits-button": editLimits, "sheet-button": sheet, sound: () => sound.toggle(),
 };
 for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
 
@@ -535,7 +567,7 @@ const askForSet = (name) => {
     ["try it for 60 s, then fall back", () => acts.trial(selected, name, car.set.revision)]);
 };
 const KEYS = {
-  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), m: mark, z: undo,
+  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), m: mark, w: sheet, z: undo,
   g: () => selected && ask(`Search the whole map for ${selected}? It gives up its pose meanwhile.`, ["search (Enter)", () => search()]),
   x: () => selected && ask(`Go back to the set before on ${selected}?`, ["go back (Enter)", () => acts.revert(selected)]), p: paint, s: shadow, o: () => large(),
   v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,

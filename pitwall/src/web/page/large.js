@@ -44,6 +44,13 @@ export class Large {
     this.recorder = element("button");
     this.recorder.addEventListener("click", () => acts.record(this.car, this.recorder.getAttribute("aria-pressed") !== "true"));
     headline.append(this.chip, this.name, this.state, this.since, this.recorder, close);
+    if (acts.beside) {
+      this.others = element("select");
+      this.others.setAttribute("aria-label", "Another car beside it");
+      this.others.addEventListener("change", () => acts.beside(this.others.value || null));
+      close.before(this.others);
+    }
+    this.sheet = element("p", "verdict");
     this.causes = element("ul");
     const big = element("div", "big");
     this.facts = [...FACTS, ...MORE].map(([label, text, off]) => {
@@ -64,7 +71,7 @@ export class Large {
     this.sets = element("table");
     this.verdict = element("p", "verdict");
     this.comparison = element("table");
-    root.append(headline, this.causes, big, charts, element("h2", "", "Sets"), this.sets, this.verdict, this.comparison);
+    root.append(headline, this.causes, this.sheet, big, charts, element("h2", "", "Sets"), this.sets, this.verdict, this.comparison);
   }
 
   update(car, index, history, now) {
@@ -74,6 +81,8 @@ export class Large {
     setText(this.name, car.car);
     setText(this.state, `${shape} ${car.state}`);
     setText(this.since, car.blind ? `silent for ${lasting(car.quiet_s)}` : `for ${lasting(car.state_for_s)}`);
+    setText(this.sheet, car.run_sheet ? `run sheet: ${car.run_sheet}` : "");
+    this.offerOthers(car.car);
     const causes = car.causes.join("\n");
     if (this.causes.dataset.text !== causes) {
       this.causes.dataset.text = causes;
@@ -100,6 +109,17 @@ export class Large {
     this.recorder.setAttribute("aria-pressed", String(state.recording));
     setText(this.recorder, state.recording ? "■ stop recording on the car" : "● record on the car");
     this.recorder.title = recorderText(state);
+  }
+
+  /// The cars that can be shown beside this one.
+  offerOthers(name) {
+    if (!this.others) return;
+    const wanted = ["", ...this.acts.cars().filter((car) => car !== name)];
+    if ([...this.others.options].map((option) => option.value).join() === wanted.join()) return;
+    const value = this.others.value;
+    this.others.replaceChildren(...wanted.map((car) => new Option(car ? `beside: ${car}` : "beside: none", car)));
+    this.others.value = wanted.includes(value) ? value : "";
+    if (this.others.value !== value) this.acts.beside(null);
   }
 
   updateSets(car) {

@@ -34,6 +34,8 @@ fn main() -> anyhow::Result<()> {
         match &arrival.event {
             SensorEvent::Odometry(odometry) => localizer.on_odometry(odometry).unwrap_or_default(),
             SensorEvent::YawRate(yaw_rate) => localizer.on_yaw_rate(yaw_rate).unwrap_or_default(),
+            // Of another localizer; SynPF has its own.
+            SensorEvent::Pose(_) => {}
             SensorEvent::Scan(scan) => {
                 if let Ok(update) = localizer.on_scan(scan) {
                     let Pose { x, y, heading } = update.pose;

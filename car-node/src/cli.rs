@@ -92,7 +92,7 @@ pub(crate) struct Run {
     pub(crate) ros_namespace: Option<String>,
     /// With --source ros2: topic to publish the pose on for the car's own nodes (nav_msgs/Odometry in frame map)
     /// [default: /pf/pose/odom in the car's namespace].
-    #[arg(long, value_name = "TOPIC")]
+    #[arg(long = "output-topic", value_name = "TOPIC")]
     pub(crate) pose_topic: Option<String>,
     /// With --source ros2: do not publish the transform from map to odom.
     #[arg(long)]
@@ -107,9 +107,16 @@ pub(crate) struct Run {
     /// Raceline to measure progress along [default: raceline.csv beside the map, if it exists].
     #[arg(long, value_name = "FILE")]
     pub(crate) raceline: Option<PathBuf>,
-    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the one last in force, else hq].
+    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the first of --localizer, else the one last
+    /// in force, else hq].
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) params: Option<String>,
+    /// Kind of localizer; without --params, its first set. `external` follows the one on --pose-topic.
+    #[arg(long, value_enum)]
+    pub(crate) localizer: Option<LocalizerKind>,
+    /// A second set on the same scans, compared with the one in force; `external` compares with the localizer on --pose-topic.
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) beside: Option<String>,
     /// Pose of base_link in the map at the start [m, m, rad]; `truth` takes it from the source, `global` searches
     /// the map [default: truth for the simulator, else global].
     #[arg(long, value_name = "X,Y,HEADING|truth|global", value_parser = start_or_global, allow_hyphen_values = true)]
@@ -208,6 +215,13 @@ pub(crate) struct TopicArguments {
     /// Gyroscope (sensor_msgs/Imu) [default: by the usual names, else the first, if any].
     #[arg(long, help_heading = TOPICS, value_name = "TOPIC")]
     pub(crate) imu_topic: Option<String>,
+    /// Poses of another localizer, such as /tracked_pose (nav_msgs/Odometry, geometry_msgs/PoseStamped,
+    /// geometry_msgs/PoseWithCovarianceStamped, or tf2_msgs/TFMessage with a transform from map).
+    #[arg(long = "pose-topic", help_heading = TOPICS, value_name = "TOPIC")]
+    pub(crate) external_pose_topic: Option<String>,
+    /// What these poses are of [default: by the message, else base_link].
+    #[arg(long, value_enum, help_heading = TOPICS, requires = "external_pose_topic")]
+    pub(crate) pose_of: Option<PosedFrame>,
     /// Pose of the laser on base_link [m, m, rad], and whether it is mounted upside down [default: from /tf_static; 0.27 m ahead
     /// without it].
     #[arg(long, help_heading = TOPICS, value_name = "X,Y,HEADING[,upside-down]", value_parser = laser, allow_hyphen_values = true)]
@@ -244,9 +258,15 @@ pub(crate) struct Evaluate {
     /// What to run over.
     #[command(flatten)]
     pub(crate) bags: Bags,
-    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file.
-    #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
-    pub(crate) params: String,
+    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the first of --localizer, else hq].
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) params: Option<String>,
+    /// Kind of localizer; without --params, its first set. `external` follows the one on --pose-topic.
+    #[arg(long, value_enum)]
+    pub(crate) localizer: Option<LocalizerKind>,
+    /// Another set to run over the same bag, in a row of its own; `external` is the localizer on --pose-topic.
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) beside: Option<String>,
     /// Pose of base_link in the map at the first scan [m, m, rad], or `truth`; without it the localizer searches the map.
     #[arg(long, value_name = "X,Y,HEADING|truth", value_parser = start, allow_hyphen_values = true)]
     pub(crate) initial_pose: Option<Start>,
@@ -328,6 +348,27 @@ pub(crate) struct Race {
     /// One JSON object on stdout; an array of rows with --table.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+/// Kinds of localizers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LocalizerKind {
+    /// SynPF.
+    Synpf,
+    /// The emulation of the reference.
+    SynpfBaseline,
+    /// Another program, such as AMCL or Cartographer.
+    External,
+}
+
+/// What the poses of another localizer are poses of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+pub(crate) enum PosedFrame {
+    /// The car.
+    BaseLink,
+    /// The laser, as MIT's particle filter has it.
+    Laser,
 }
 
 /// Where the driver gets the pose from.

@@ -264,6 +264,79 @@ fn a_part_of_a_bag_can_be_evaluated() {
 }
 
 #[test]
+fn another_localizer_is_judged_beside_ours() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    // The truth stands in for a very good localizer.
+    let start = ["--initial-pose", "truth", "--beside", "external", "--json"];
+    let topic = ["--pose-topic", "/ground_truth/odom"];
+    let output = evaluate(&map, &bag, &[&start[..], &topic[..]].concat());
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    let rows: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).expect("an array");
+    let [ours, theirs] = &rows[..] else {
+        panic!("two rows: {rows:?}");
+    };
+    assert_eq!(
+        (&ours["params"], &theirs["params"]),
+        (&"hq".into(), &"external".into())
+    );
+    let rmse = theirs["position_error_m"]["rmse"].as_f64().expect("truth");
+    assert!(rmse < 0.005, "{theirs}");
+    assert!(
+        theirs["state_share"]["localized"].as_f64().expect("judged") > 0.5,
+        "{theirs}"
+    );
+    assert!(theirs["updates"].as_u64().expect("a count") >= 150, "{theirs}");
+
+    // Alone, and with what is missing.
+    let output = evaluate(
+        &map,
+        &bag,
+        &[&["--localizer", "external", "--json"][..], &topic[..]].concat(),
+    );
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    for (more, code, words) in [
+        (&["--localizer", "external"][..], 2, "--pose-topic"),
+        (
+            &["--localizer", "external", "--pose-topic", "/amcl_pose"],
+            1,
+            "no topic /amcl_pose",
+        ),
+        (
+            &[
+                "--localizer",
+                "external",
+                "--pose-topic",
+                "/vesc/odom",
+                "--odom-topic",
+                "/vesc/odom",
+            ],
+            1,
+            "frame is \"odom\"",
+        ),
+        (
+            &["--localizer", "external", "--pose-topic", "/tf_static"],
+            1,
+            "no transform from map",
+        ),
+        (&["--beside", "hq"], 2, "the same set"),
+    ] {
+        let output = evaluate(&map, &bag, more);
+        let text = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(code), "{text}");
+        assert!(text.contains(words), "{text} should say {words}");
+    }
+}
+
+#[test]
 fn faults_are_named_with_their_file() {
     let folder = tempfile::tempdir().expect("folder");
     let here = folder.path();

@@ -61,6 +61,7 @@ fn race(track: Track, others: &[CarSetup], moving: f64, seconds: f64) -> SensorL
                     }
                     SensorEvent::Scan(scan) => drop(localizer.on_scan(scan)),
                     SensorEvent::YawRate(yaw_rate) => drop(localizer.on_yaw_rate(yaw_rate)),
+                    SensorEvent::Pose(pose) => drop(localizer.on_external_pose(pose)),
                 }
                 estimate = estimate.filter(|_| elapsed < moving);
                 log.arrivals.push(Arrival { log_time: due, event });

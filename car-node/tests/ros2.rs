@@ -118,7 +118,7 @@ impl RosCar {
                     ..RosOdometry::default()
                 }),
             ),
-            SensorEvent::YawRate(_) => {}
+            SensorEvent::YawRate(_) | SensorEvent::Pose(_) => {}
         }
     }
 }

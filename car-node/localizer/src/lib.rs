@@ -18,6 +18,7 @@
 //! }
 //! ```
 
+mod external_pose;
 mod hand_over;
 mod parameters;
 mod scan_fit;
@@ -31,6 +32,7 @@ use std::fmt;
 
 use maps::Pose;
 
+pub use external_pose::{ExternalPose, PoseOf};
 pub use hand_over::{HandOver, HandedEstimate};
 pub use parameters::{ParameterFault, ParameterValues, PreparedParameters, overlay, to_values};
 pub use scan_fit::ScanFit;
@@ -48,6 +50,9 @@ pub enum PoseError {
     /// A pose that is nowhere on the map.
     #[error("pose ({:.2}, {:.2}) is off the map", .0.x, .0.y)]
     OffMap(Pose),
+    /// The pose comes from another localizer.
+    #[error("the pose comes from another localizer, which has to be given it itself")]
+    Elsewhere,
 }
 
 /// Work that takes longer than an update, to be run on another thread.
@@ -72,6 +77,11 @@ pub trait Localizer: fmt::Debug + Send {
 
     /// Takes in a gyroscope's reading. Takes microseconds.
     fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped>;
+
+    /// Takes in a pose from another localizer. Only a localizer that follows another one needs it.
+    fn on_external_pose(&mut self, _pose: &ExternalPose) -> Result<(), Dropped> {
+        Ok(())
+    }
 
     /// Takes in a scan and updates the pose.
     fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped>;

@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use car_node::control::parameter_sets::NamedSet;
 use car_node::evaluate::{Fault, FaultReport, Nees, Outcome, Truth, run as run_over};
 use car_node::health::State;
-use car_node::localization::Start;
+use car_node::localization::{EXTERNAL, Start};
 use car_node::sensors::bag::SensorLog;
 use car_node::statistics::ErrorSummary;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -42,13 +43,20 @@ struct Report {
 }
 
 pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
-    if arguments.poses.is_some() && arguments.bags.files.len() * arguments.seed.len() > 1 {
-        let text = "--poses writes the poses of one run: give one --bag and one --seed";
+    let runs = arguments.bags.files.len() * arguments.seed.len();
+    if arguments.poses.is_some() && (runs > 1 || arguments.beside.is_some()) {
+        let text = "--poses writes the poses of one run: give one --bag, one --seed and no --beside";
         bail!(BadUsage(text.into()));
     }
     let mut faults = arguments.fault.clone();
     faults.sort_by(|a, b| a.at.total_cmp(&b.at));
-    let set = super::load_set(&arguments.params)?;
+    let set = match super::chosen_set(arguments.params.as_deref(), arguments.localizer)? {
+        Some(set) => set,
+        None => super::load_set("hq")?,
+    };
+    let beside = super::set_beside(arguments.beside.as_deref(), Some(&set))?;
+    let sets: Vec<NamedSet> = std::iter::once(set).chain(beside).collect();
+    super::check_pose_topic(&sets, arguments.bags.topics.external_pose_topic.as_deref())?;
     let map = super::load_map(&arguments.bags.map)?;
     let mut logs = super::read_bags(&arguments.bags)?;
     for (bag, log) in &mut logs {
@@ -77,7 +85,9 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
         Start::Global => None,
     };
     let before = Instant::now();
-    set.parameters.prepare_tables(&map, place);
+    for set in &sets {
+        set.parameters.prepare_tables(&map, place);
+    }
     let range_table = RangeTable {
         build_ms: before.elapsed().as_secs_f64() * 1e3,
         bytes: map.table_bytes(),
@@ -88,9 +98,18 @@ pub(crate) fn run(arguments: &Evaluate) -> anyhow::Result<()> {
     for (bag, log) in &logs {
         let truth = Truth::new(log.truth.clone());
         let mount = super::mount(bag, log);
-        for &seed in &arguments.seed {
+        let runs = sets
+            .iter()
+            .flat_map(|set| arguments.seed.iter().map(move |&seed| (set, seed)));
+        for (set, seed) in runs {
             let mut localizer = set.parameters.build(&map, mount.base_link_from_laser, seed)?;
             let progress = progress_bar(bag, seed);
+            // Another localizer has its own start.
+            let start = if set.parameters.kind() == EXTERNAL {
+                Start::Global
+            } else {
+                start
+            };
             let outcome = over_bag(localizer.as_mut(), log, &truth, start, poses.as_mut(), &progress)
                 .with_context(|| bag.display().to_string())?;
             reports.push(Report {
@@ -321,8 +340,9 @@ fn print_one(report: &Report) {
 /// Prints several runs, one row each.
 fn print_table(reports: &[Report]) {
     say!(
-        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+        "{:<28} {:<14} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
         "bag",
+        "set",
         "seed",
         "updates",
         "dropped",
@@ -339,7 +359,8 @@ fn print_table(reports: &[Report]) {
         "us p99"
     );
     say!(
-        "{:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
+        "{:<28} {:<14} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8}",
+        "",
         "",
         "",
         "",
@@ -366,7 +387,8 @@ fn print_table(reports: &[Report]) {
         };
         previous = Some(&report.bag);
         say!(
-            "{name:<28} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+            "{name:<28} {:<14} {:>4} {:>7} {:>7} {:>8} {:>8} {:>8} {:>8} {:>8} {:>8} {:>6} {:>6} {:>6} {:>7} {:>7}",
+            report.params,
             report.seed,
             outcome.updates,
             outcome.dropped.values().sum::<usize>(),

@@ -23,13 +23,14 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use car_node::control::parameter_sets::{self, NamedSet, SetError};
 use car_node::evaluate::read_poses;
+use car_node::localization::EXTERNAL;
 use car_node::sensors::bag::{Bag, SensorLog, Topics};
 use car_node::sensors::frames::Mount;
 use maps::{MapError, OccupancyGrid};
 use simulator::{BUNDLED, Track};
-use synpf::TrackMap;
+use synpf::{PoseOf, TrackMap};
 
-use crate::cli::{Bags, TopicArguments};
+use crate::cli::{Bags, LocalizerKind, PosedFrame, TopicArguments};
 
 /// Prints a line. Ends the program quietly when stdout is closed, as after `| head`; `println!` would panic.
 fn say(line: &str) {
@@ -88,6 +89,11 @@ fn topics(arguments: &TopicArguments) -> Topics {
         odometry: arguments.odom_topic.clone(),
         truth: arguments.truth_topic.clone(),
         imu: arguments.imu_topic.clone(),
+        pose: arguments.external_pose_topic.clone(),
+        pose_of: arguments.pose_of.map(|of| match of {
+            PosedFrame::BaseLink => PoseOf::BaseLink,
+            PosedFrame::Laser => PoseOf::Laser,
+        }),
     }
 }
 
@@ -125,6 +131,56 @@ fn load_set(name_or_path: &str) -> anyhow::Result<NamedSet> {
         );
     }
     Ok(set)
+}
+
+/// The set that `--params` names, or else the first one of the kind that `--localizer` names.
+fn chosen_set(params: Option<&str>, localizer: Option<LocalizerKind>) -> anyhow::Result<Option<NamedSet>> {
+    let first = localizer.map(|kind| match kind {
+        LocalizerKind::Synpf => ("hq", "synpf"),
+        LocalizerKind::SynpfBaseline => ("synpf-baseline", "reference"),
+        LocalizerKind::External => (EXTERNAL, EXTERNAL),
+    });
+    let Some(name) = params.or(first.map(|(name, _)| name)) else {
+        return Ok(None);
+    };
+    let set = load_set(name)?;
+    if let Some((_, kind)) = first
+        && set.parameters.kind() != kind
+    {
+        let other = set.parameters.kind();
+        let text = format!("--params {name} is a set for {other}, and --localizer asks for {kind}");
+        bail!(BadUsage(text));
+    }
+    Ok(Some(set))
+}
+
+/// The set that `--beside` names, to run beside `set`.
+fn set_beside(beside: Option<&str>, set: Option<&NamedSet>) -> anyhow::Result<Option<NamedSet>> {
+    let beside = beside.map(load_set).transpose()?;
+    if let (Some(beside), Some(set)) = (&beside, set)
+        && beside.name == set.name
+    {
+        let text = format!(
+            "--beside {}: the same set is in force; another one is needed",
+            set.name
+        );
+        bail!(BadUsage(text));
+    }
+    Ok(beside)
+}
+
+/// Refuses to follow another localizer whose topic is not given.
+fn check_pose_topic<'a>(
+    sets: impl IntoIterator<Item = &'a NamedSet>,
+    pose_topic: Option<&str>,
+) -> anyhow::Result<()> {
+    let external = sets.into_iter().any(|set| set.parameters.kind() == EXTERNAL);
+    if external && pose_topic.is_none() {
+        let text = "the set external follows another localizer: give the topic of its poses with --pose-topic, such as \
+                    /amcl_pose or /tracked_pose";
+        bail!(BadUsage(text.into()));
+    }
+    Ok(())
 }
 
 /// A bundled track, or the one at a path; `raceline` replaces its raceline.

@@ -54,7 +54,12 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
             let ros_node = connection
                 .announce()
                 .map_err(|error| anyhow!("cannot join the ROS graph: {error}"))?;
-            ros_sink = Some(ros_output(arguments, &car, &connection, &ros_node, &map)?);
+            // Two localizers must not publish the same transform.
+            if let Some(topic) = &arguments.topics.external_pose_topic {
+                eprintln!("{car}: nothing is published to ROS: the localizer on {topic} serves the car");
+            } else {
+                ros_sink = Some(ros_output(arguments, &car, &connection, &ros_node, &map)?);
+            }
             ros = Some((connection, ros_node));
             (map, Box::new(source), Start::Global)
         }
@@ -72,7 +77,12 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     };
     let description = source.description();
     let mut config = NodeConfig::new(car.clone(), map, source);
-    config.set = arguments.params.as_deref().map(super::load_set).transpose()?;
+    config.set = super::chosen_set(arguments.params.as_deref(), arguments.localizer)?;
+    config.beside = super::set_beside(arguments.beside.as_deref(), config.set.as_ref())?;
+    super::check_pose_topic(
+        config.set.iter().chain(&config.beside),
+        arguments.topics.external_pose_topic.as_deref(),
+    )?;
     config.start = arguments.initial_pose.unwrap_or(start);
     config.seed = arguments.seed;
     config.rate = arguments.rate;

@@ -10,7 +10,7 @@ use synpf::Stamp;
 use super::answer_cache::CachedAnswer;
 use super::parameter_sets;
 use super::persisted_state::{PersistedState, SavedSet};
-use crate::localization::LocalizerParameters;
+use crate::localization::{EXTERNAL, LocalizerParameters};
 use crate::wire;
 
 /// The set in force.
@@ -87,6 +87,8 @@ pub struct ParameterStore {
     in_force: InForce,
     previous: Option<(String, LocalizerParameters)>,
     pending: Option<PendingTrial>,
+    /// The car has another localizer to follow.
+    external: bool,
 }
 
 impl ParameterStore {
@@ -110,7 +112,20 @@ impl ParameterStore {
             },
             previous: None,
             pending: None,
+            external: false,
         }
+    }
+
+    /// The same with the set that follows another localizer, if the car has one.
+    #[must_use]
+    pub fn with_external(self, external: bool) -> Self {
+        Self { external, ..self }
+    }
+
+    /// Names of the sets that every car of this kind has.
+    fn built_in(&self) -> impl Iterator<Item = &'static str> + use<> {
+        let external = self.external.then_some(EXTERNAL);
+        LocalizerParameters::NAMES.into_iter().chain(external)
     }
 
     /// What must survive a restart.
@@ -161,9 +176,9 @@ impl ParameterStore {
                 to: pending.to.0.clone(),
                 at: pending.at.0,
             }),
-            available: LocalizerParameters::NAMES
-                .iter()
-                .map(|name| (*name).to_owned())
+            available: self
+                .built_in()
+                .map(str::to_owned)
                 .chain(self.persisted.sets.keys().cloned())
                 .collect(),
         }
@@ -217,7 +232,7 @@ impl ParameterStore {
                 })))
             }
             ParamsAction::Delete { name } => {
-                if LocalizerParameters::NAMES.contains(&name.as_str()) {
+                if self.built_in().any(|known| known == name) {
                     return Err(fault(format!("{name} is built in and cannot be deleted")));
                 }
                 if *name == self.in_force.name {
@@ -247,7 +262,7 @@ impl ParameterStore {
 
     fn plan_put(&self, set: &ParameterSet, revert_after_ms: Option<u32>) -> Result<Decision, Refusal> {
         let mut faults = Vec::new();
-        if LocalizerParameters::NAMES.contains(&set.name.as_str()) {
+        if set.name == EXTERNAL || LocalizerParameters::NAMES.contains(&set.name.as_str()) {
             faults.push(format!("{} is built in and cannot be overwritten", set.name));
         }
         if self.persisted.sets.len() >= MOST_SETS && !self.persisted.sets.contains_key(&set.name) {
@@ -338,6 +353,9 @@ impl ParameterStore {
     }
 
     fn find(&self, name: &str) -> Option<LocalizerParameters> {
+        if name == EXTERNAL && !self.external {
+            return None;
+        }
         LocalizerParameters::named(name).or_else(|| Some(self.persisted.sets.get(name)?.parameters.clone()))
     }
 
@@ -349,7 +367,7 @@ impl ParameterStore {
     }
 
     fn list(&self) -> Vec<StoredSet> {
-        let shipped = LocalizerParameters::NAMES.iter().filter_map(|name| {
+        let shipped = self.built_in().filter_map(|name| {
             Some(StoredSet {
                 set: parameter_set(name, &LocalizerParameters::named(name)?),
                 built_in: true,
@@ -437,6 +455,28 @@ mod tests {
             }
             other => panic!("no change: {other:?}"),
         }
+    }
+
+    #[test]
+    fn another_localizer_is_a_set_of_the_cars_that_have_one() {
+        let select = ParamsAction::Select {
+            name: EXTERNAL.into(),
+            revert_after_ms: None,
+        };
+        let shadow = ParamsAction::Shadow {
+            name: Some(EXTERNAL.into()),
+        };
+        let mut without = store();
+        assert!(without.plan(&select, None).is_err());
+        assert!(!without.params().available.contains(&EXTERNAL.to_owned()));
+        let mut with = store().with_external(true);
+        assert!(matches!(with.plan(&select, None), Ok(Decision::Change(_))));
+        assert!(matches!(with.plan(&shadow, None), Ok(Decision::Shadow(Some(_)))));
+        assert!(with.params().available.contains(&EXTERNAL.to_owned()));
+        let delete = ParamsAction::Delete {
+            name: EXTERNAL.into(),
+        };
+        assert!(with.plan(&delete, None).is_err());
     }
 
     #[test]

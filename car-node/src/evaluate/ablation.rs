@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::Value;
 use synpf::{ParameterFault, Parameters, ReferenceParameters};
 
-use crate::localization::LocalizerParameters;
+use crate::localization::{KIND_KEY, LocalizerParameters};
 
 /// An improvement, and the keys that it changes.
 type Improvement = (&'static str, &'static [&'static str]);
@@ -128,6 +128,12 @@ pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFau
             });
             let groups = groups(&plain, target, &IMPROVEMENTS);
             (plain, groups)
+        }
+        LocalizerParameters::External(_) => {
+            return Err(vec![ParameterFault {
+                key: KIND_KEY.into(),
+                fault: format!("{} is no improvement of the reference", target.kind()),
+            }]);
         }
     };
     add(&mut steps, &groups, target)?;

@@ -134,6 +134,7 @@ pub fn run(
                 result
             }
             SensorEvent::YawRate(yaw_rate) => localizer.on_yaw_rate(yaw_rate),
+            SensorEvent::Pose(pose) => localizer.on_external_pose(pose),
             SensorEvent::Scan(scan) => {
                 if scans == 0 {
                     begin(localizer, truth, start, latest_odometry.unwrap_or(scan.stamp))?;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, select};
 use maps::{Pose, Raceline};
 use protocol::{Cause, CauseKind, EventKind, Rates, SetRef, Severity};
-use synpf::{Dropped, Hypothesis, Localizer, Odometry, Scan, Stamp, TrackMap, Update};
+use synpf::{Dropped, ExternalPose, Hypothesis, Localizer, Odometry, Scan, Stamp, TrackMap, Update};
 
 use super::filter_command::{FilterCommand, LocalizerChange};
 use super::job_worker::JobWorker;
@@ -80,6 +80,8 @@ struct FilterWorker {
     last_update: Option<Update>,
     last_state: State,
     last_odometry: Option<Pose>,
+    /// The newest pose of another localizer, for one that starts to follow it.
+    last_external: Option<ExternalPose>,
     listed: Listed,
     /// Faults of sensors that an event was sent for.
     announced: Vec<CauseKind>,
@@ -111,6 +113,7 @@ pub fn start(
             last_update: None,
             last_state,
             last_odometry: None,
+            last_external: None,
             listed: Listed::default(),
             announced: Vec::new(),
             tables,
@@ -220,6 +223,9 @@ impl FilterWorker {
                 .map_err(|_| "the set is for another kind of localizer".to_owned()),
             LocalizerChange::Replace(mut successor) => {
                 successor.take_over(localizer.hand_over());
+                if let Some(pose) = &self.last_external {
+                    successor.on_external_pose(pose).ok();
+                }
                 *localizer = successor;
                 self.jobs.discard();
                 Ok(())
@@ -306,6 +312,11 @@ impl FilterWorker {
                     self.config.shared.telemetry.record(Record::YawRate(yaw_rate));
                 }
                 result
+            }
+            SensorEvent::Pose(pose) => {
+                self.last_external = Some(pose);
+                self.forward(|| ShadowInput::Pose(pose));
+                self.config.localizer.on_external_pose(&pose)
             }
             SensorEvent::Scan(scan) => self.on_scan(scan, queued),
         };

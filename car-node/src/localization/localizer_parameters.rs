@@ -13,6 +13,8 @@ use synpf::{
     ReferenceParameters, ReferenceTuning, SetUpError, SynPf, TrackMap, Tuning, parameter_table,
 };
 
+use super::external::{External, ExternalParameters};
+
 /// A parameter set for one kind of localizer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ParameterValues", into = "ParameterValues")]
@@ -21,12 +23,16 @@ pub enum LocalizerParameters {
     SynPf(Box<Parameters>),
     /// For the reference emulation.
     Reference(Box<ReferenceParameters>),
+    /// For following another localizer.
+    External(ExternalParameters),
 }
 
 /// The key that says which kind of localizer a set is for.
 pub const KIND_KEY: &str = "localizer";
 const SYNPF: &str = "synpf";
 const REFERENCE: &str = "reference";
+/// The kind that follows another localizer, and its set.
+pub const EXTERNAL: &str = "external";
 
 /// A key that only sets of the reference had when it was a mode of SynPF.
 const FORMER_KEY: &str = "defect_update_per_odometry";
@@ -57,14 +63,23 @@ impl From<ReferenceParameters> for LocalizerParameters {
     }
 }
 
+impl From<ExternalParameters> for LocalizerParameters {
+    fn from(parameters: ExternalParameters) -> Self {
+        Self::External(parameters)
+    }
+}
+
 impl LocalizerParameters {
-    /// The names of the sets that ship.
+    /// The names of the sets that ship for every car. [`EXTERNAL`] is one for cars with another localizer.
     pub const NAMES: [&'static str; 4] = ["hq", "lq", "adaptive", "synpf-baseline"];
 
     /// A set that ships, by name.
     pub fn named(name: &str) -> Option<Self> {
         if name == "synpf-baseline" {
             return Some(ReferenceParameters::default().into());
+        }
+        if name == EXTERNAL {
+            return Some(ExternalParameters::default().into());
         }
         Parameters::named(name).map(Into::into)
     }
@@ -77,6 +92,7 @@ impl LocalizerParameters {
         let kind = table.remove(KIND_KEY);
         match kind_of(kind.as_ref()).map_err(|fault| vec![fault])? {
             SYNPF => Parameters::from_table(&table).map(|(set, unknown)| (set.into(), unknown)),
+            EXTERNAL => with(ExternalParameters::default().with_values(table)),
             _ => ReferenceParameters::from_table(table).map(|(set, unknown)| (set.into(), unknown)),
         }
     }
@@ -88,16 +104,18 @@ impl LocalizerParameters {
             Some(_) => match kind_of(kind)? {
                 kind if kind == self.kind() => self.clone(),
                 SYNPF => Parameters::default().into(),
+                EXTERNAL => ExternalParameters::default().into(),
                 _ => ReferenceParameters::default().into(),
             },
         })
     }
 
-    /// Which kind of localizer it is for: `synpf` or `reference`.
+    /// Which kind of localizer it is for: `synpf`, `reference` or `external`.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::SynPf(_) => SYNPF,
             Self::Reference(_) => REFERENCE,
+            Self::External(_) => EXTERNAL,
         }
     }
 
@@ -106,6 +124,7 @@ impl LocalizerParameters {
         let mut values = match self {
             Self::SynPf(parameters) => parameters.to_values(),
             Self::Reference(parameters) => parameters.to_values(),
+            Self::External(parameters) => parameters.to_values(),
         };
         values.insert(KIND_KEY.into(), self.kind().into());
         values
@@ -122,6 +141,7 @@ impl LocalizerParameters {
         match self.of_kind(kind.as_ref()).map_err(|fault| vec![fault])? {
             Self::SynPf(base) => with(base.with_values(given)),
             Self::Reference(base) => with(base.with_values(given)),
+            Self::External(base) => with(base.with_values(given)),
         }
     }
 
@@ -130,6 +150,7 @@ impl LocalizerParameters {
         match self {
             Self::SynPf(parameters) => parameters.validate(),
             Self::Reference(parameters) => parameters.validate(),
+            Self::External(parameters) => parameters.validate(),
         }
     }
 
@@ -138,6 +159,8 @@ impl LocalizerParameters {
         match self {
             Self::SynPf(parameters) => map.prepare(map_from_base_link, parameters),
             Self::Reference(parameters) => Reference::prepare(map, map_from_base_link, parameters),
+            // It casts few rays.
+            Self::External(_) => {}
         }
     }
 
@@ -152,6 +175,10 @@ impl LocalizerParameters {
             Self::SynPf(parameters) => PreparedParameters::new(Tuning::new(Parameters::clone(parameters))?),
             Self::Reference(parameters) => {
                 PreparedParameters::new(ReferenceTuning::new(ReferenceParameters::clone(parameters), map)?)
+            }
+            Self::External(parameters) => {
+                parameters.validate()?;
+                PreparedParameters::new(*parameters)
             }
         })
     }
@@ -173,6 +200,8 @@ impl LocalizerParameters {
                 let parameters = ReferenceParameters::clone(parameters);
                 Box::new(Reference::new(map, base_link_from_laser, parameters, seed)?)
             }
+            // It throws no dice.
+            Self::External(parameters) => Box::new(External::new(map, base_link_from_laser, *parameters)?),
         })
     }
 }
@@ -188,10 +217,11 @@ fn kind_of(value: Option<&Value>) -> Result<&'static str, ParameterFault> {
     match value.map(Value::as_str) {
         None | Some(Some(SYNPF)) => Ok(SYNPF),
         Some(Some(REFERENCE)) => Ok(REFERENCE),
+        Some(Some(EXTERNAL)) => Ok(EXTERNAL),
         Some(_) => Err(ParameterFault {
             key: KIND_KEY.into(),
             fault: format!(
-                "{} is neither {SYNPF} nor {REFERENCE}",
+                "{} is none of {SYNPF}, {REFERENCE}, {EXTERNAL}",
                 value.unwrap_or(&Value::Null)
             ),
         }),
@@ -221,7 +251,11 @@ impl TryFrom<ParameterValues> for LocalizerParameters {
         }
         let kind = kind_of(kind.as_ref()).map_err(|fault| fault.to_string())?;
         let values = Value::Object(values.into_iter().collect());
-        if kind == REFERENCE || former {
+        if kind == EXTERNAL {
+            let set: ExternalParameters =
+                serde_json::from_value(values).map_err(|error| error.to_string())?;
+            Ok(set.into())
+        } else if kind == REFERENCE || former {
             let set: ReferenceParameters =
                 serde_json::from_value(values).map_err(|error| error.to_string())?;
             Ok(set.into())

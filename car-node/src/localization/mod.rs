@@ -1,5 +1,6 @@
 //! The localizer at work: the thread that owns it, the shadow set beside it, and laps.
 
+mod external;
 pub mod filter_command;
 pub mod filter_worker;
 mod job_worker;
@@ -13,5 +14,6 @@ mod start;
 pub mod table_worker;
 mod views;
 
-pub use localizer_parameters::{KIND_KEY, LocalizerParameters};
+pub use external::{External, ExternalParameters};
+pub use localizer_parameters::{EXTERNAL, KIND_KEY, LocalizerParameters};
 pub use start::Start;

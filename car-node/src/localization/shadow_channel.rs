@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use crossbeam_channel::{Receiver, Sender, bounded};
 use maps::Pose;
 use protocol::SetRef;
-use synpf::{Odometry, Scan, Update, YawRate};
+use synpf::{ExternalPose, Odometry, Scan, Update, YawRate};
 
 /// What the filter sends to the shadow.
 #[derive(Debug)]
@@ -15,6 +15,8 @@ pub enum ShadowInput {
     Odometry(Odometry),
     /// A yaw rate that the filter has received.
     YawRate(YawRate),
+    /// A pose of another localizer.
+    Pose(ExternalPose),
     /// A scan that led to an update.
     Scan(Box<ShadowScan>),
     /// The filter was given a new pose; the shadow starts again from it.

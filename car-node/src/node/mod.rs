@@ -32,9 +32,10 @@ use crate::control::{
     CommandHandlerConfig, LocalCommands, SEARCH_PATIENCE, StateFile, StateFileError, command_server,
 };
 use crate::health::{Monitor, Thresholds};
+use crate::localization::EXTERNAL;
 use crate::localization::Start;
 use crate::localization::filter_worker::{self, FilterConfig};
-use crate::localization::shadow;
+use crate::localization::shadow::{self, ShadowCommand};
 use crate::localization::shadow_channel::shadow_channel;
 use crate::network::{self, NetworkError};
 use crate::recording::{FileHead, FileServer, RecordError, RecordOptions, RecorderThread};
@@ -70,6 +71,8 @@ pub struct NodeConfig {
     pub rate: f64,
     /// The set to start with; None for the one that was in force when the car last ran, and `hq` for a new car.
     pub set: Option<NamedSet>,
+    /// A set to run beside it on the same scans, and to compare with it.
+    pub beside: Option<NamedSet>,
     /// Where the localizer starts.
     pub start: Start,
     /// Seed of the filter.
@@ -100,6 +103,7 @@ impl NodeConfig {
             source,
             rate: 1.0,
             set: None,
+            beside: None,
             start: Start::Truth,
             seed: 0,
             connect: Vec::new(),
@@ -193,6 +197,7 @@ impl Node {
             mut source,
             rate,
             set,
+            beside,
             start,
             seed,
             connect,
@@ -210,7 +215,8 @@ impl Node {
         let persisted = file
             .as_ref()
             .map_or(Ok(PersistedState::default()), StateFile::read)?;
-        let set = first_set(set, &persisted)?;
+        let external = source.pose_topic().is_some();
+        let set = first_set(set, &persisted, external)?;
         let mount = source.mount();
         let mut localizer = set.parameters.build(&map.map, mount.base_link_from_laser, seed)?;
         let known = match start {
@@ -278,7 +284,7 @@ impl Node {
         let (to_file_server, file_requests) = bounded(FILE_REQUESTS);
         let (to_shadow, shadow_commands) = bounded(QUEUE);
         let (shadow_sender, shadow_receiver) = shadow_channel();
-        let store = ParameterStore::new(persisted, set.name, set.parameters, started);
+        let store = ParameterStore::new(persisted, set.name, set.parameters, started).with_external(external);
 
         shared.event(
             clock.now(),
@@ -319,6 +325,25 @@ impl Node {
             Arc::clone(&shared),
             clock.clone(),
         )?;
+        if let Some(set) = beside {
+            set.parameters.prepare_tables(&map.map, known);
+            let localizer = set.parameters.build(&map.map, mount.base_link_from_laser, seed)?;
+            shared.set_shadow(Some(set.name.clone()));
+            let run = ShadowCommand::Run {
+                name: set.name.clone(),
+                who: "start".into(),
+                localizer,
+            };
+            // The thread lives as long as this sender.
+            to_shadow.send(run).ok();
+            shared.event(
+                clock.now(),
+                0,
+                EventKind::ShadowStarted { set: set.name },
+                None,
+                None,
+            );
+        }
         let command_server = command_server::start(
             CommandHandlerConfig {
                 store,
@@ -482,11 +507,19 @@ fn describe(
 }
 
 /// The set to start with.
-fn first_set(wanted: Option<NamedSet>, persisted: &PersistedState) -> Result<NamedSet, SetError> {
+fn first_set(
+    wanted: Option<NamedSet>,
+    persisted: &PersistedState,
+    external: bool,
+) -> Result<NamedSet, SetError> {
     if let Some(set) = wanted {
         return Ok(set);
     }
-    let name = persisted.settled.as_deref().unwrap_or("hq");
+    let settled = persisted.settled.as_deref();
+    // Without the topic of another localizer there is nothing to follow.
+    let name = settled
+        .filter(|name| external || *name != EXTERNAL)
+        .unwrap_or("hq");
     if let Some(stored) = persisted.sets.get(name) {
         return Ok(NamedSet {
             name: name.into(),
@@ -501,8 +534,15 @@ fn first_set(wanted: Option<NamedSet>, persisted: &PersistedState) -> Result<Nam
 /// Gives the localizer its initial pose, and returns true; or starts the search of the map, and returns false.
 fn start_at(localizer: &mut dyn Localizer, start: Start, truth: Option<Pose>) -> Result<bool, NodeError> {
     match start {
-        Start::Pose(pose) => localizer.initialize(pose)?,
-        Start::Truth => localizer.initialize(truth.ok_or(NodeError::NoTruth)?)?,
+        // A localizer that follows another one has its pose from there.
+        Start::Pose(pose) => match localizer.initialize(pose) {
+            Ok(()) | Err(PoseError::Elsewhere) => {}
+            Err(error) => return Err(error.into()),
+        },
+        Start::Truth => {
+            let pose = truth.ok_or(NodeError::NoTruth)?;
+            start_at(localizer, Start::Pose(pose), truth)?;
+        }
         Start::Global => {
             localizer.relocalize();
             return Ok(false);

@@ -38,6 +38,24 @@ pub fn decode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, CdrError> {
         .map_err(|error| CdrError::Body(error.to_string()))
 }
 
+/// Decodes a message that must use the whole payload, but for its padding.
+pub(crate) fn decode_whole<T: DeserializeOwned>(payload: &[u8]) -> Result<T, CdrError> {
+    const PADDING: usize = 3;
+    let Some((header, body)) = payload.split_at_checked(4) else {
+        return Err(CdrError::TooShort(payload.len()));
+    };
+    let decoded = match header[..2] {
+        [0, 0] => cdr_encoding::from_bytes::<T, BigEndian>(body),
+        [0, 1] => cdr_encoding::from_bytes::<T, LittleEndian>(body),
+        _ => return Err(CdrError::Encapsulation(header[0], header[1])),
+    };
+    let (message, used) = decoded.map_err(|error| CdrError::Body(error.to_string()))?;
+    if used + PADDING < body.len() {
+        return Err(CdrError::Body(format!("{} bytes are left", body.len() - used)));
+    }
+    Ok(message)
+}
+
 /// Encodes a message as little-endian CDR with its encapsulation header.
 pub fn encode<T: Serialize>(message: &T) -> Result<Vec<u8>, CdrError> {
     let body = cdr_encoding::to_vec::<T, LittleEndian>(message)

@@ -18,6 +18,7 @@ pub struct BagPlayer {
     begins: Stamp,
     mount: Mount,
     start: Option<Pose>,
+    pose_topic: Option<String>,
 }
 
 impl BagPlayer {
@@ -48,6 +49,7 @@ impl BagPlayer {
             path,
             begins: feeds.first().map_or(Stamp(0), |(due, _)| *due),
             feeds: feeds.into_iter(),
+            pose_topic: log.topics.pose,
             mount: log.mount.unwrap_or_else(Mount::typical),
             start,
         }
@@ -69,6 +71,10 @@ impl Source for BagPlayer {
 
     fn start(&self) -> Option<Pose> {
         self.start
+    }
+
+    fn pose_topic(&self) -> Option<&str> {
+        self.pose_topic.as_deref()
     }
 
     fn next(&mut self, _: Option<PoseEstimate>) -> Next {

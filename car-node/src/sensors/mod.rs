@@ -3,6 +3,7 @@
 pub mod bag;
 mod bag_player;
 pub mod clock;
+pub(crate) mod external_pose;
 pub mod frames;
 mod ros2;
 mod simulated;
@@ -105,6 +106,10 @@ pub trait Source: Send {
     fn clock(&mut self, rate: f64) -> SensorClock;
     /// The car's first pose, if the source knows it.
     fn start(&self) -> Option<Pose>;
+    /// The topic of another localizer's poses, if it is one of those delivered.
+    fn pose_topic(&self) -> Option<&str> {
+        None
+    }
     /// Waits for the next message, a tenth of a second at most. `estimate` is the filter's latest.
     fn next(&mut self, estimate: Option<PoseEstimate>) -> Next;
 }

@@ -96,7 +96,7 @@ impl Counters {
                 push(&mut interval.scan_ages, age);
             }
             SensorEvent::Odometry(_) => interval.odometry += 1,
-            SensorEvent::YawRate(_) => {}
+            SensorEvent::YawRate(_) | SensorEvent::Pose(_) => {}
         });
     }
 

@@ -97,9 +97,9 @@ pub use beam_layout::{BeamLayout, BeamParameters};
 pub use error::SetUpError;
 pub use global_search::{GlobalCheck, GlobalCheckOutcome};
 pub use localizer::{
-    Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
-    ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, SensorFinding, SensorFindings,
-    Stamp, Twist, Update, WeightedPose, YawRate,
+    Doubt, Dropped, ExternalPose, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode,
+    Odometry, ParameterFault, ParameterValues, PoseError, PoseOf, PreparedParameters, Scan, SensorFinding,
+    SensorFindings, Stamp, Twist, Update, WeightedPose, YawRate,
 };
 pub use motion_model::{MotionModel, MotionParameters};
 pub use parameters::{Parameters, parameter_table};

@@ -2,10 +2,12 @@
 
 use std::sync::{Arc, OnceLock};
 
+use localizer::ScanFit;
 use maps::{Cell, DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::error::SetUpError;
+use crate::quality::Quality;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::reference::RangeTables;
 use crate::regions::{NOWHERE, Region, regions};
@@ -91,6 +93,23 @@ impl TrackMap {
             .field
             .trace(start, [cos as f32, sin as f32], (max_range / resolution) as f32);
         (f64::from(cells) * resolution).min(max_range)
+    }
+
+    /// How well a scan, given as end points in the frame of `base_link` \[m\], fits the map at a pose in `map`.
+    pub fn scan_fit(
+        &self,
+        points: &[[f32; 2]],
+        base_link_from_laser: Pose,
+        map_from_base_link: Pose,
+    ) -> ScanFit {
+        let pose = self.grid_from_map * map_from_base_link;
+        let quality = Quality::of_points(self, points, base_link_from_laser, pose);
+        ScanFit {
+            alignment: quality.alignment,
+            residual: quality.residual,
+            short_beams: quality.short,
+            long_beams: quality.long,
+        }
     }
 
     /// The same map with another policy for tables that are missing, and without those that were built.

@@ -19,7 +19,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, select};
 use protocol::EventKind;
-use synpf::{Localizer, Mode, Stamp};
+use synpf::{Localizer, Mode, PoseError, Stamp};
 
 use self::budget::{Budget, ScanCost};
 use self::comparison::{ComparisonWindow, ScanOutcome};
@@ -158,6 +158,10 @@ impl ShadowWorker {
                 running.localizer.on_yaw_rate(&yaw_rate).ok();
                 None
             }
+            ShadowInput::Pose(pose) => {
+                running.localizer.on_external_pose(&pose).ok();
+                None
+            }
             ShadowInput::PoseReset => {
                 running.initialized = None;
                 None
@@ -226,7 +230,11 @@ impl RunningShadow {
             return None;
         }
         if self.initialized.is_none() {
-            self.localizer.initialize(force.pose).ok()?;
+            match self.localizer.initialize(force.pose) {
+                // A localizer that follows another one has its pose from there.
+                Ok(()) | Err(PoseError::Elsewhere) => {}
+                Err(_) => return None,
+            }
             self.window = ComparisonWindow::default();
         }
         let initialized = *self.initialized.get_or_insert(force.stamp);

@@ -1,13 +1,14 @@
 //! Chooses the topics of one car, and makes of their messages what a localizer takes.
 
 use maps::Pose;
-use synpf::{Odometry, Stamp};
+use synpf::{ExternalPose, Odometry, Stamp};
 
 use super::{
     Arrival, Bag, BagError, IMU_NAMES, Messages, ODOMETRY_NAMES, SensorEvent, SensorLog, StampedPoses,
     TRUTH_NAMES, Topics, is_wheel_odometry,
 };
 use crate::ros2::messages::{LaserScan, RosOdometry};
+use crate::sensors::external_pose::PoseFrames;
 use crate::sensors::frames::{BASE_LINK, Frames, Mount, is_base};
 use crate::statistics::percentile;
 
@@ -38,7 +39,8 @@ impl Bag {
             })?
             .into_iter()
             .filter(|(topic, _)| {
-                wanted.odometry.is_some() || (Some(*topic) != truth_topic && is_wheel_odometry(topic))
+                let other = [truth_topic, wanted.pose.as_deref()].contains(&Some(*topic));
+                wanted.odometry.is_some() || (!other && is_wheel_odometry(topic))
             })
             .collect();
         let imus = self.of_kind("sensor_msgs/Imu", wanted.imu.as_deref(), |m| match m {
@@ -84,9 +86,24 @@ impl Bag {
         ];
         to_one_clock(&mut streams, &mut notes);
 
+        let frames = PoseFrames {
+            laser: scans_taken
+                .first()
+                .map_or_else(String::new, |(_, scan)| scan.header.frame_id.clone()),
+            odom: odometry
+                .first()
+                .map_or_else(String::new, |(_, odometry)| odometry.header.frame_id.clone()),
+            of: wanted.pose_of,
+        };
+        let mut poses = match &wanted.pose {
+            Some(topic) => self.external_poses(topic, &frames)?,
+            None => Vec::new(),
+        };
+
         // Of messages with the same log time, odometry comes first: the prediction for a scan needs it.
         let mut arrivals = odometry_events;
         arrivals.append(&mut imu_events);
+        arrivals.append(&mut poses);
         arrivals.append(&mut scan_events);
         arrivals.sort_by_key(|arrival| arrival.log_time);
         let mut log = SensorLog {
@@ -97,6 +114,8 @@ impl Bag {
                 odometry: Some(odometry_topic.to_owned()),
                 truth: truth_topic.map(str::to_owned),
                 imu: imu.map(|(topic, _)| topic.to_owned()),
+                pose: wanted.pose.clone(),
+                pose_of: wanted.pose_of,
             },
             truth: truth.map(|(_, poses)| poses).unwrap_or_default(),
             notes,
@@ -164,6 +183,32 @@ impl Bag {
             }),
             (found, _) => Ok(found),
         }
+    }
+
+    /// The poses of another localizer.
+    fn external_poses(&self, topic: &str, frames: &PoseFrames) -> Result<Vec<Arrival>, BagError> {
+        let fault = |fault: String| BagError::Topic {
+            path: self.path.clone(),
+            topic: topic.to_owned(),
+            fault,
+        };
+        let poses = match self.topics.get(topic) {
+            Some(Messages::Odometry(list)) => read(list, |message| frames.odometry(message).map(Some)),
+            Some(Messages::Pose(list)) => read(list, |message| frames.pose_stamped(message).map(Some)),
+            Some(Messages::PoseWithCovariance(list)) => {
+                read(list, |message| frames.with_covariance(message).map(Some))
+            }
+            Some(Messages::Tf(list)) => read(list, |message| Ok(frames.transform(message))),
+            Some(Messages::Scan(_) | Messages::Imu(_)) | None => {
+                return Err(self.missing(&format!("{topic} of a type with poses")));
+            }
+        };
+        let poses = poses.map_err(fault)?;
+        if poses.is_empty() {
+            let text = "there is no pose on it: no message, or no transform from map to a frame of the car";
+            return Err(fault(text.into()));
+        }
+        Ok(poses)
     }
 
     /// The frames that do not move: those of `/tf_static`, and what `/tf` repeats without a change.
@@ -245,6 +290,21 @@ impl SensorLog {
             self.truth.clear();
         }
     }
+}
+
+/// The arrivals of another localizer's poses.
+fn read<T>(
+    messages: &[(Stamp, T)],
+    pose: impl Fn(&T) -> Result<Option<ExternalPose>, String>,
+) -> Result<Vec<Arrival>, String> {
+    let arrival = |(log_time, message): &(Stamp, T)| {
+        let event = pose(message).transpose()?;
+        Some(event.map(|pose| Arrival {
+            log_time: *log_time,
+            event: SensorEvent::Pose(pose),
+        }))
+    };
+    messages.iter().filter_map(arrival).collect()
 }
 
 /// The namespace of a topic: `/car2` for `/car2/scan`, nothing for `/scan`.

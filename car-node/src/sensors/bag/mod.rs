@@ -24,10 +24,12 @@ use std::path::{Path, PathBuf};
 
 use maps::Pose;
 use serde::de::DeserializeOwned;
-use synpf::{Odometry, Scan, Stamp, YawRate};
+use synpf::{ExternalPose, Odometry, PoseOf, Scan, Stamp, YawRate};
 
 use self::reader::{Encoding, Fault, Sink, plain_message};
-use crate::ros2::messages::{self, Imu, LaserScan, PoseStamped, RosOdometry, TfMessage};
+use crate::ros2::messages::{
+    self, Imu, LaserScan, PoseStamped, PoseWithCovarianceStamped, RosOdometry, TfMessage,
+};
 use crate::ros2::topics;
 use crate::sensors::frames::Mount;
 
@@ -40,6 +42,8 @@ pub enum SensorEvent {
     Odometry(Odometry),
     /// A gyroscope's yaw rate.
     YawRate(YawRate),
+    /// A pose from another localizer.
+    Pose(ExternalPose),
 }
 
 impl SensorEvent {
@@ -49,6 +53,7 @@ impl SensorEvent {
             Self::Scan(scan) => scan.stamp,
             Self::Odometry(odometry) => odometry.stamp,
             Self::YawRate(yaw_rate) => yaw_rate.stamp,
+            Self::Pose(pose) => pose.stamp,
         }
     }
 
@@ -58,6 +63,7 @@ impl SensorEvent {
             Self::Scan(scan) => &mut scan.stamp,
             Self::Odometry(odometry) => &mut odometry.stamp,
             Self::YawRate(yaw_rate) => &mut yaw_rate.stamp,
+            Self::Pose(pose) => &mut pose.stamp,
         }
     }
 }
@@ -82,6 +88,11 @@ pub struct Topics {
     pub truth: Option<String>,
     /// `sensor_msgs/Imu`.
     pub imu: Option<String>,
+    /// Poses of another localizer: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `geometry_msgs/PoseWithCovarianceStamped`
+    /// or `tf2_msgs/TFMessage`. None takes none.
+    pub pose: Option<String>,
+    /// What these are poses of; None goes by the messages.
+    pub pose_of: Option<PoseOf>,
 }
 
 /// The usual names, preferred first.
@@ -148,6 +159,16 @@ pub enum BagError {
         /// The topic.
         topic: String,
     },
+    /// A topic that is asked for cannot be used.
+    #[error("{path}: {topic}: {fault}")]
+    Topic {
+        /// The bag.
+        path: PathBuf,
+        /// The topic.
+        topic: String,
+        /// Why.
+        fault: String,
+    },
     /// The laser's pose is unknown.
     #[error(
         "{path}: /tf_static does not connect {base_link} with {laser}; give the laser's pose with --laser x,y,heading"
@@ -184,6 +205,7 @@ enum Messages {
     Odometry(Vec<(Stamp, RosOdometry)>),
     Imu(Vec<(Stamp, Imu)>),
     Pose(Vec<(Stamp, PoseStamped)>),
+    PoseWithCovariance(Vec<(Stamp, PoseWithCovarianceStamped)>),
     Tf(Vec<(Stamp, TfMessage)>),
 }
 
@@ -195,6 +217,7 @@ impl Messages {
             "nav_msgs/Odometry" => Self::Odometry(Vec::new()),
             "sensor_msgs/Imu" => Self::Imu(Vec::new()),
             "geometry_msgs/PoseStamped" => Self::Pose(Vec::new()),
+            "geometry_msgs/PoseWithCovarianceStamped" => Self::PoseWithCovariance(Vec::new()),
             "tf2_msgs/TFMessage" | "tf/tfMessage" => Self::Tf(Vec::new()),
             _ => return None,
         })
@@ -211,6 +234,7 @@ impl Messages {
             Self::Odometry(list) => list.push((log_time, decode(encoding, payload)?)),
             Self::Imu(list) => list.push((log_time, decode(encoding, payload)?)),
             Self::Pose(list) => list.push((log_time, decode(encoding, payload)?)),
+            Self::PoseWithCovariance(list) => list.push((log_time, decode(encoding, payload)?)),
             Self::Tf(list) => list.push((log_time, decode(encoding, payload)?)),
         }
         Ok(())
@@ -222,6 +246,7 @@ impl Messages {
             Self::Odometry(list) => list.len(),
             Self::Imu(list) => list.len(),
             Self::Pose(list) => list.len(),
+            Self::PoseWithCovariance(list) => list.len(),
             Self::Tf(list) => list.len(),
         }
     }

@@ -132,7 +132,7 @@ fn note(message: TopicMessage, sending: &mut Sending, behind: &mut f64) {
             }
             insert(&mut sending.transforms, topic, frames);
         }
-        Ok(Content::InitialPose(_) | Content::ClickedPoint) => {}
+        Ok(Content::InitialPose(_) | Content::ClickedPoint | Content::Pose(_)) => {}
         Err(error) => tracing::warn!(%topic, %error, "a message cannot be read"),
     }
 }

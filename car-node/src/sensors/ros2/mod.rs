@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, RecvTimeoutError, bounded};
 use maps::Pose;
 use nalgebra::UnitQuaternion;
-use synpf::Stamp;
+use synpf::{PoseOf, Stamp};
 use zenoh::sample::Locality;
 use zenoh::{Config, Session, Wait};
 use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
@@ -29,7 +29,7 @@ use self::choice::{Choice, is_transform_topic_of, mount, namespace_of};
 use self::clock_follower::ClockFollower;
 use self::discovery::{Discovered, discover};
 use self::ros_graph::RosGraph;
-use self::topics::{Content, Intake, Kind, TopicMessage, listener};
+use self::topics::{Content, Intake, Kind, TopicMessage, listener, pose_listener};
 use super::{Feed, Next, PoseEstimate, Source};
 use crate::ros2::graph::Naming;
 use crate::ros2::messages::{PoseWithCovarianceStamped, TfMessage, Time};
@@ -37,6 +37,7 @@ use crate::ros2::output_publisher::RosConnection;
 use crate::ros2::topics as outputs;
 use crate::sensors::bag::{SensorEvent, Topics};
 use crate::sensors::clock::{SensorClock, StampShift, wall_now};
+use crate::sensors::external_pose::{PoseFrames, PoseMessage};
 use crate::sensors::frames::{Frames, Mount};
 
 /// Which ROS side to connect to, and which topics to take.
@@ -78,9 +79,13 @@ impl Ros2Options {
     /// Refuses a topic that is both an input and an output.
     fn check(&self) -> Result<(), Ros2Error> {
         let Topics {
-            scan, odometry, imu, ..
+            scan,
+            odometry,
+            imu,
+            pose,
+            ..
         } = &self.topics;
-        let inputs = [scan, odometry, imu, &self.initial_pose_topic];
+        let inputs = [scan, odometry, imu, pose, &self.initial_pose_topic];
         let same = |a: &str, b: &str| a.trim_matches('/') == b.trim_matches('/');
         match inputs
             .into_iter()
@@ -106,6 +111,8 @@ impl Ros2Options {
                 odometry: absolute(&self.topics.odometry),
                 imu: absolute(&self.topics.imu),
                 truth: None,
+                pose: absolute(&self.topics.pose),
+                pose_of: self.topics.pose_of,
             },
             initial_pose_topic: absolute(&self.initial_pose_topic),
             ..self.clone()
@@ -147,6 +154,8 @@ pub struct Ros2 {
     endpoint: String,
     choice: Choice,
     initial_pose: String,
+    /// The topic of another localizer's poses, and what they are of.
+    pose: (Option<String>, Option<PoseOf>),
     /// Frames of the laser, the IMU and the car.
     scan_frame: String,
     imu_frame: Option<String>,
@@ -211,6 +220,9 @@ impl Ros2 {
         let clicked_point = in_namespace(Kind::ClickedPoint);
         subscribers.extend(subscription.by_name(Kind::InitialPose, &initial_pose)?);
         subscribers.extend(subscription.by_name(Kind::ClickedPoint, &clicked_point)?);
+        if let Some(topic) = &options.topics.pose {
+            subscribers.extend(subscription.poses(topic)?);
+        }
         // Publishers that were not chosen may stop again.
         graph.rename(
             options.domain,
@@ -271,6 +283,7 @@ impl Ros2 {
             last: [None; 2],
             pending: notes.iter().cloned().map(Feed::Log).collect(),
             notes,
+            pose: (options.topics.pose.clone(), options.topics.pose_of),
             initial_pose,
             undecodable: BTreeMap::new(),
             dropped: 0,
@@ -364,6 +377,7 @@ impl Ros2 {
             }
             Ok(Content::InitialPose(pose)) => Some(initial_pose(&topic, &pose)),
             Ok(Content::ClickedPoint) => Some(Feed::GlobalSearch { by: topic }),
+            Ok(Content::Pose(message)) => self.external_pose(&topic, &message),
             Ok(Content::Transforms(message)) if is_transform_topic_of(&topic, &self.choice.scan) => {
                 self.late_transforms(&topic, &message)
             }
@@ -374,6 +388,28 @@ impl Ros2 {
                 count
                     .is_power_of_two()
                     .then(|| Feed::Log(format!("{topic}: {count} messages do not decode: {error}")))
+            }
+        }
+    }
+
+    /// A pose of another localizer, its stamp on the filter's clock.
+    fn external_pose(&mut self, topic: &str, message: &PoseMessage) -> Option<Feed> {
+        let frames = PoseFrames {
+            laser: self.scan_frame.clone(),
+            odom: self.ros.odom.clone(),
+            of: self.pose.1,
+        };
+        match frames.pose_of(message) {
+            Ok(pose) => pose.map(|mut pose| {
+                pose.stamp = Stamp(pose.stamp.0.saturating_add(self.follower.shift()));
+                Feed::Sensor(SensorEvent::Pose(pose))
+            }),
+            Err(fault) => {
+                let count = self.undecodable.entry(topic.to_owned()).or_insert(0);
+                *count += 1;
+                count
+                    .is_power_of_two()
+                    .then(|| Feed::Log(format!("{topic}: {count} poses are not taken: {fault}")))
             }
         }
     }
@@ -541,10 +577,19 @@ impl Source for Ros2 {
             scan, odometry, imu, ..
         } = &self.choice;
         let imu = imu.as_ref().map_or(String::new(), |imu| format!(", {imu}"));
+        let pose = self
+            .pose
+            .0
+            .as_ref()
+            .map_or(String::new(), |pose| format!(", {pose}"));
         format!(
-            "ROS 2 at {}: {scan}, {odometry}{imu}; initial poses from {}",
+            "ROS 2 at {}: {scan}, {odometry}{imu}{pose}; initial poses from {}",
             self.endpoint, self.initial_pose
         )
+    }
+
+    fn pose_topic(&self) -> Option<&str> {
+        self.pose.0.as_deref()
     }
 
     fn mount(&self) -> Mount {
@@ -669,6 +714,23 @@ impl Subscription<'_> {
             .into_iter()
             .map(|key| self.declare(kind, &key))
             .collect()
+    }
+
+    /// The poses of another localizer, of any type, with `rmw_zenoh` and behind a bridge.
+    fn poses(&self, topic: &str) -> Result<Vec<AnySubscriber>, Ros2Error> {
+        let name = topic.trim_matches('/');
+        let mut subscribers: Vec<AnySubscriber> = Vec::new();
+        for key in [format!("{}/{name}/*/*", self.domain), name.to_owned()] {
+            let failed =
+                |error: zenoh::Error| Ros2Error::Zenoh(format!("cannot subscribe to {key}: {error}"));
+            let subscriber = self
+                .session
+                .declare_subscriber(key.clone())
+                .with(pose_listener(topic, self.intake))
+                .allowed_origin(Locality::Remote);
+            subscribers.push(Box::new(subscriber.wait().map_err(failed)?));
+        }
+        Ok(subscribers)
     }
 
     fn declare(&self, kind: Kind, key: &str) -> Result<AnySubscriber, Ros2Error> {

@@ -15,6 +15,7 @@ use crate::ros2::messages::{
 };
 use crate::ros2::types::{self, RosType};
 use crate::sensors::bag::{IMU_NAMES, ODOMETRY_NAMES, SCAN_NAMES, Topics};
+use crate::sensors::external_pose::PoseMessage;
 
 /// The kinds of messages that the node subscribes to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -98,6 +99,8 @@ pub(super) enum Content {
     Imu(Box<Imu>),
     Transforms(Box<TfMessage>),
     InitialPose(Box<PoseWithCovarianceStamped>),
+    /// Of another localizer.
+    Pose(PoseMessage),
     /// Where the point is does not matter.
     ClickedPoint,
 }
@@ -147,6 +150,22 @@ impl Intake {
     pub(super) fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
+}
+
+/// The same for the poses of another localizer on `topic`, of whatever type.
+pub(super) fn pose_listener(topic: &str, intake: &Intake) -> Callback<Sample> {
+    let (intake, topic) = (intake.clone(), topic.to_owned());
+    Callback::from(move |sample: Sample| {
+        let message = TopicMessage {
+            content: PoseMessage::decode(&sample.payload().to_bytes()).map(Content::Pose),
+            topic: topic.clone(),
+            hash: None,
+            arrival: Instant::now(),
+        };
+        if intake.sender.try_send(message).is_err() {
+            intake.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    })
 }
 
 /// Decodes messages in zenoh's thread and queues them. A message that finds the queue full is dropped and counted.

@@ -45,6 +45,9 @@ pub(crate) enum Command {
     Race(Race),
     /// Make, check or draw a track.
     Track(Track),
+    /// Make a parameter set of another localizer's file: SynPF's pf2_params.yaml, MIT's particle filter's, nav2's or ROS 1's
+    /// AMCL's. Says of each value what became of it.
+    Import(Import),
 }
 
 /// Where the sensor data comes from.
@@ -382,6 +385,26 @@ pub(crate) enum PoseSource {
     Odometry,
     /// The true pose.
     Truth,
+}
+
+/// Arguments of `import`.
+#[derive(Debug, Args)]
+pub(crate) struct Import {
+    /// The other localizer's YAML file; it may hold other nodes, too.
+    #[arg(value_name = "FILE.yaml")]
+    pub(crate) file: PathBuf,
+    /// The set to write [default: FILE_set.yaml in this folder].
+    #[arg(long, value_name = "SET.yaml")]
+    pub(crate) out: Option<PathBuf>,
+    /// Edge of a cell of the map that the file was used with [m], 0.001 to 1: MIT's sigma_hit is in cells.
+    #[arg(long, value_name = "METRES", default_value = "0.05", allow_negative_numbers = true, value_parser = |text: &str| within(text, 0.001, 1.0))]
+    pub(crate) resolution: f64,
+    /// Overwrite an existing set.
+    #[arg(long)]
+    pub(crate) force: bool,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// Arguments of `track`.

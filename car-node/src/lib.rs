@@ -39,6 +39,7 @@
 pub mod control;
 pub mod evaluate;
 pub mod health;
+pub mod import;
 pub mod localization;
 pub mod network;
 pub mod node;

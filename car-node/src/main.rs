@@ -22,6 +22,7 @@ fn main() -> ExitCode {
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Ablate(arguments) => commands::ablate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Race(arguments) => commands::race::run(&arguments),
+        Command::Import(arguments) => commands::import::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Track(arguments) => commands::track::run(&arguments.command).map(|()| ExitCode::SUCCESS),
     };
     match result {

@@ -12,6 +12,7 @@ macro_rules! say {
 pub(crate) mod ablate;
 mod drawing;
 pub(crate) mod evaluate;
+pub(crate) mod import;
 pub(crate) mod race;
 pub(crate) mod run;
 pub(crate) mod track;

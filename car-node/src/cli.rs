@@ -14,6 +14,8 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
 
+use crate::commands::placement::cpu_list;
+
 /// The on-car node: localizes a 1:10 race car and publishes its pose and health.
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
@@ -140,6 +142,12 @@ pub(crate) struct Run {
     /// Do not publish the full-rate streams for the recorder (about 1 Mbit/s).
     #[arg(long)]
     pub(crate) no_recorded: bool,
+    /// Cores to run on, such as 3 or 2-3 [default: all].
+    #[arg(long, value_name = "LIST", value_parser = cpu_list)]
+    pub(crate) cpus: Option<String>,
+    /// Niceness, -20 to 19; negative comes before other programs, and needs the right to do so.
+    #[arg(long, value_name = "NICE", allow_negative_numbers = true, value_parser = clap::value_parser!(i8).range(-20..=19))]
+    pub(crate) priority: Option<i8>,
     /// Stay on the network after the end of the bag.
     #[arg(long)]
     pub(crate) stay: bool,

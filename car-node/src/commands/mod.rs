@@ -13,6 +13,7 @@ pub(crate) mod ablate;
 mod drawing;
 pub(crate) mod evaluate;
 pub(crate) mod import;
+pub(crate) mod placement;
 pub(crate) mod race;
 pub(crate) mod run;
 pub(crate) mod track;

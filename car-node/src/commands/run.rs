@@ -31,6 +31,7 @@ const DEFAULT_NAME: &str = "car-1";
 
 pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let car = name(arguments)?;
+    super::placement::place(arguments.cpus.as_deref(), arguments.priority)?;
     let signal = signals()?;
     let (mut ros, mut ros_sink) = (None, None);
     let (map, source, start): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {

@@ -242,10 +242,13 @@ fn none(why: &str) -> Outcome {
     Outcome::NoCounterpart { why: why.into() }
 }
 
-fn option(option: &str, value: &Value) -> Outcome {
-    let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+/// An option that names a topic, with the slash that ROS puts in front.
+fn topic(option: &str, value: &Value) -> Outcome {
+    let Some(name) = value.as_str() else {
+        return none("the value is no topic");
+    };
     Outcome::Option {
-        option: format!("{option} {text}"),
+        option: format!("{option} /{}", name.trim_start_matches('/')),
     }
 }
 
@@ -263,8 +266,8 @@ fn common(key: &str, value: &Value) -> Option<Outcome> {
         "max_particles" | "min_particles" => number(value, |count| {
             taken(key, count.round().clamp(10.0, MOST_PARTICLES) as u64)
         }),
-        "scan_topic" => option("--scan-topic", value),
-        "odometry_topic" | "odom_topic" => option("--odom-topic", value),
+        "scan_topic" => topic("--scan-topic", value),
+        "odometry_topic" | "odom_topic" => topic("--odom-topic", value),
         "range_method" => match value.as_str() {
             Some("glt" | "lut") => converted("range_method", "lut", "the table is called lut here"),
             Some("pcddt" | "cddt") => {
@@ -534,7 +537,7 @@ mod tests {
     fn mits_hits_are_in_cells() {
         let text = "particle_filter:\n  ros__parameters:\n    angle_step: 18\n    max_particles: 4000\n    sigma_hit: 8.0\n    \
                     z_hit: 0.75\n    z_short: 0.01\n    z_max: 0.07\n    z_rand: 0.12\n    range_method: rmgpu\n    \
-                    motion_dispersion_theta: 0.25\n    scan_topic: /scan\n    colour: red\n";
+                    motion_dispersion_theta: 0.25\n    scan_topic: scan\n    colour: red\n";
         let import = import(text, 0.05).expect("MIT's");
         assert_eq!(import.dialect, Dialect::Mit);
         assert!((value(&import, "sigma_hit") - 0.4).abs() < 1e-9);

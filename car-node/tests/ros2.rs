@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::ros2::messages::{
-    self, Header, LaserScan, PointStamped, PoseWithCovarianceStamped, RosOdometry, RosPose, TfMessage,
-    TransformStamped, Vector3,
+    self, Header, LaserScan, PointStamped, PoseStamped, PoseWithCovarianceStamped, RosOdometry, RosPose,
+    TfMessage, TransformStamped, Vector3,
 };
 use car_node::ros2::output_publisher;
 use car_node::ros2::output_publisher::OutputOptions;
@@ -23,7 +23,7 @@ use common::router;
 use maps::Pose;
 use serde::Serialize;
 use simulator::{CarSetup, Track};
-use synpf::{Stamp, TrackMap};
+use synpf::{PoseOf, Stamp, TrackMap};
 use zenoh::{Session, Wait};
 use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig};
 
@@ -460,6 +460,71 @@ fn an_initial_pose_is_taken_from_its_own_topic_only() {
             };
             assert_eq!(by, expected);
             assert!((pose.x - 3.0).abs() < 1e-9, "{pose:?} of {by}");
+        }
+    }
+}
+
+#[test]
+fn the_poses_of_another_localizer_are_taken_on_request_whatever_their_type() {
+    let (router, endpoint) = router();
+    let at = |x: f64| RosPose::from(Pose::new(x, 0.0, 0.0));
+    let odometry = |x| RosOdometry {
+        header: header("map", wall_now()),
+        child_frame_id: "laser".into(),
+        pose: at(x),
+        ..RosOdometry::default()
+    };
+    let stamped = |x| PoseStamped {
+        header: header("map", wall_now()),
+        pose: at(x),
+    };
+    let transform = |x| TfMessage {
+        transforms: vec![TransformStamped {
+            header: header("map", wall_now()),
+            child_frame_id: "odom".into(),
+            transform: at(x),
+        }],
+    };
+    let sends: [(&str, PoseOf, &dyn Fn() -> Vec<u8>); 3] = [
+        ("nav_msgs::msg::dds_::Odometry_", PoseOf::Laser, &|| {
+            bytes(&odometry(2.0))
+        }),
+        (
+            "geometry_msgs::msg::dds_::PoseStamped_",
+            PoseOf::BaseLink,
+            &|| bytes(&stamped(3.0)),
+        ),
+        ("tf2_msgs::msg::dds_::TFMessage_", PoseOf::Odometry, &|| {
+            bytes(&transform(4.0))
+        }),
+    ];
+    for naming in [Naming::RmwZenoh, Naming::Bridge] {
+        for (dds_type, of, payload) in sends {
+            let options = Ros2Options {
+                topics: Topics {
+                    pose: Some("their/pose".into()),
+                    ..Topics::default()
+                },
+                ..options(&endpoint)
+            };
+            let mut source = find_in(&router, "", &options);
+            assert_eq!(source.pose_topic(), Some("/their/pose"));
+            let until = Instant::now() + DEADLINE;
+            let taken = 'taken: loop {
+                assert!(Instant::now() < until, "no pose of type {dds_type}");
+                let key = naming.key("their/pose", dds_type);
+                router.put(key, payload()).wait().expect("published");
+                while let Next::Due(_, feed) = source.next(None) {
+                    if let Feed::Sensor(SensorEvent::Pose(pose)) = feed {
+                        break 'taken pose;
+                    }
+                }
+            };
+            assert_eq!(taken.of, of, "{dds_type}");
+            assert!(
+                taken.pose.x > 1.5 && taken.stamp.since(wall_now()).abs() < 10.0,
+                "{taken:?}"
+            );
         }
     }
 }

@@ -156,12 +156,13 @@ fn ros2(arguments: &Run, car: &CarName, signal: &Receiver<&'static str>) -> anyh
         namespace: arguments.ros_namespace.clone(),
         topics: super::topics(&arguments.topics),
         initial_pose_topic: arguments.initial_pose_topic.clone(),
-        outputs: arguments
-            .pose_topic
-            .iter()
-            .cloned()
-            .chain(topics::POSES.map(str::to_owned))
-            .collect(),
+        // Beside another localizer, this node publishes nothing, and that one's topics may have the same names.
+        outputs: if arguments.topics.external_pose_topic.is_some() {
+            Vec::new()
+        } else {
+            let usual = topics::POSES.map(str::to_owned);
+            arguments.pose_topic.iter().cloned().chain(usual).collect()
+        },
         mount: arguments.topics.laser,
     };
     let mut printed = String::new();

@@ -197,7 +197,7 @@ def drive(radio, start, node, wall, car_side, wall_side, folder):
             faults.append(fault)
 
     record = start(
-        wall_side, wall, "--json", "--listen", f"tcp/{WALL}:{PORT}", "--listen", f"tcp/127.0.0.1:{PORT}",
+        wall_side, wall, "--json", "--insecure", "--listen", f"tcp/{WALL}:{PORT}", "--listen", f"tcp/127.0.0.1:{PORT}",
         "record", "-o", f"{folder}/race.mcap",
     )  # fmt: skip
     start(

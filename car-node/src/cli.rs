@@ -50,6 +50,40 @@ pub(crate) enum Command {
     /// Make a parameter set of another localizer's file: SynPF's pf2_params.yaml, MIT's particle filter's, nav2's or ROS 1's
     /// AMCL's. Says of each value what became of it.
     Import(Import),
+    /// Check clock, CPU, memory, map, disk, keys and network, and say what to do. The exit code is 1 if something is bad.
+    Doctor(Doctor),
+    /// Exit with 0 if the car with this state folder runs: a container's health check.
+    Health {
+        /// The car's --state folder.
+        #[arg(long, value_name = "FOLDER")]
+        state: PathBuf,
+    },
+}
+
+/// Arguments of `doctor`, as for `run`.
+#[derive(Debug, Args)]
+pub(crate) struct Doctor {
+    /// Map: a map_server YAML file.
+    #[arg(long, value_name = "MAP.yaml")]
+    pub(crate) map: Option<PathBuf>,
+    /// The car's name.
+    #[arg(long, value_name = "NAME", default_value = "car-1")]
+    pub(crate) car: CarName,
+    /// Pit wall that the car connects to; may be repeated.
+    #[arg(long, value_name = "ENDPOINT", value_parser = endpoint)]
+    pub(crate) connect: Vec<String>,
+    /// Keys of this car.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) keys: Option<PathBuf>,
+    /// File with the passphrase.
+    #[arg(long, value_name = "FILE", conflicts_with = "keys")]
+    pub(crate) passphrase_file: Option<PathBuf>,
+    /// Folder for sets that are stored on the car.
+    #[arg(long, value_name = "FOLDER")]
+    pub(crate) state: Option<PathBuf>,
+    /// One JSON array on stdout.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// Where the sensor data comes from.
@@ -132,10 +166,19 @@ pub(crate) struct Run {
     /// Play a bag this many times as fast, 0.01 to 1000.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, allow_negative_numbers = true, value_parser = rate)]
     pub(crate) rate: f64,
-    /// Pit wall to connect to, such as tcp/192.168.1.10:7447; may be repeated [default: one on this machine, or one found by
-    /// multicast].
+    /// Pit wall to connect to: tls/192.168.1.10:7447 with keys, else tcp/...; may be repeated [default: one on this machine; with
+    /// --keys, --passphrase-file or --insecure also one found by multicast].
     #[arg(long, value_name = "ENDPOINT", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
+    /// Keys of this car, made by `pitwall keys new` [default: $SYNPF_KEYS].
+    #[arg(long, value_name = "FILE")]
+    pub(crate) keys: Option<PathBuf>,
+    /// File with the passphrase that pit wall and cars share, where there are no keys [default: $SYNPF_PASSPHRASE_FILE].
+    #[arg(long, value_name = "FILE", conflicts_with = "keys")]
+    pub(crate) passphrase_file: Option<PathBuf>,
+    /// Without keys and passphrase, look for a pit wall by multicast, too; everybody on that network can command the car.
+    #[arg(long)]
+    pub(crate) insecure: bool,
     /// Publish predicted poses at odometry rate, and not only at scan rate.
     #[arg(long)]
     pub(crate) predict: bool,

@@ -7,14 +7,19 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use cli::{Cli, Command};
+use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
     // zenoh warns of what is meant to be so; what concerns the driver we say ourselves.
+    let filter =
+        EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off".into());
+    // At debug level zenoh prints its configuration, and with it the password.
+    let filter = match "zenoh::api::session=off".parse() {
+        Ok(quiet) => filter.add_directive(quiet),
+        Err(_) => filter,
+    };
     tracing_subscriber::fmt()
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env()
-                .unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off".into()),
-        )
+        .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .init();
     let result = match Cli::parse().command {
@@ -23,6 +28,8 @@ fn main() -> ExitCode {
         Command::Ablate(arguments) => commands::ablate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Race(arguments) => commands::race::run(&arguments),
         Command::Import(arguments) => commands::import::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::Doctor(arguments) => commands::doctor::run(&arguments),
+        Command::Health { state } => commands::health::run(&state).map(|()| ExitCode::SUCCESS),
         Command::Track(arguments) => commands::track::run(&arguments.command).map(|()| ExitCode::SUCCESS),
     };
     match result {

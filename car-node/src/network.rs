@@ -6,6 +6,7 @@
 
 use std::time::Duration;
 
+use keys::{Protection, Side};
 use protocol::{CarName, Key, Topic};
 use zenoh::config::EndPoint;
 use zenoh::liveliness::LivelinessToken;
@@ -26,6 +27,9 @@ pub enum NetworkError {
         /// Why.
         reason: String,
     },
+    /// The keys cannot be used, or do not fit an endpoint. The message holds no secret.
+    #[error("{0}")]
+    Keys(String),
     /// The session does not open.
     #[error("the zenoh session does not open: {0}")]
     Open(String),
@@ -40,7 +44,10 @@ pub enum NetworkError {
 }
 
 /// Where a pit wall on this machine listens.
-const LOCAL_WALL: &str = "tcp/127.0.0.1:7447";
+const LOCAL_ADDRESS: &str = "127.0.0.1:7447";
+
+/// Longest message from the network \[bytes\], the same as at the pit wall: whoever sends a longer one is disconnected there.
+const LONGEST_MESSAGE: usize = 17 * 1024 * 1024;
 
 /// Send buffer of the operating system [bytes]: enough for 10 Mbit/s at a round trip of 10 ms.
 const SEND_BUFFER: usize = 16 * 1024;
@@ -63,12 +70,41 @@ pub fn endpoint(text: &str) -> Result<String, String> {
     }
 }
 
-/// Opens a session that connects to the endpoints `connect`. Without one it looks for a pit wall on this machine and by
-/// multicast.
-pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
-    let scout = connect.is_empty().to_string();
+/// The first endpoint that is not on this machine.
+pub fn remote_endpoint(connect: &[String]) -> Option<&str> {
+    let remote = |endpoint: &&String| {
+        let Ok(endpoint) = endpoint.parse::<EndPoint>() else {
+            return true;
+        };
+        let address = endpoint.address();
+        let host = address.as_str().rsplit_once(':').map_or("", |(host, _)| host);
+        let host = host.trim_matches(['[', ']']);
+        let local = host == "localhost"
+            || host
+                .parse::<std::net::IpAddr>()
+                .is_ok_and(|host| host.is_loopback());
+        !local
+    };
+    connect.iter().find(remote).map(String::as_str)
+}
+
+/// Opens the session of `car`, which connects to the endpoints `connect`. Without one it looks for a pit wall on this machine.
+/// With `search` it also looks by multicast.
+pub fn open(
+    car: &CarName,
+    connect: &[String],
+    protection: &Protection,
+    search: bool,
+) -> Result<Session, NetworkError> {
+    for endpoint in connect {
+        protection.check_endpoint(endpoint).map_err(NetworkError::Keys)?;
+    }
+    let protected = protection
+        .settings(&Side::Car(car.clone()))
+        .map_err(|error| NetworkError::Keys(error.to_string()))?;
+    let scout = (search && connect.is_empty()).to_string();
     let endpoints = if connect.is_empty() {
-        serde_json::json!([LOCAL_WALL]).to_string()
+        serde_json::json!([format!("{}/{LOCAL_ADDRESS}", protection.scheme())]).to_string()
     } else {
         serde_json::json!(connect).to_string()
     };
@@ -91,6 +127,7 @@ pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
         // On a slow link messages should wait in zenoh's queues, where a pose overtakes a scan, and not in the buffers of the
         // operating system. Those hold megabytes: a minute of a slow link.
         ("transport/link/tcp/so_sndbuf", SEND_BUFFER.to_string()),
+        ("transport/link/rx/max_message_size", LONGEST_MESSAGE.to_string()),
         ("transport/link/tx/batch_size", BATCH.to_string()),
         ("transport/link/tx/queue/size/data", "4".to_owned()),
         ("transport/link/tx/queue/size/data_low", "16".to_owned()),
@@ -109,6 +146,17 @@ pub fn open(connect: &[String]) -> Result<Session, NetworkError> {
                 value,
                 reason: error.to_string(),
             })?;
+    }
+    for (key, value) in &protected.entries {
+        // The value holds secrets: it is not part of the error.
+        config
+            .insert_json5(key, value)
+            .map_err(|_| NetworkError::Keys(format!("zenoh refuses its setting {key}")))?;
+    }
+    if matches!(protection, Protection::Keys(_)) {
+        config
+            .insert_json5("transport/link/tls/so_sndbuf", &SEND_BUFFER.to_string())
+            .map_err(|_| NetworkError::Keys("zenoh refuses the size of its send buffer".into()))?;
     }
     zenoh::open(config)
         .wait()

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Parser;
+use keys::Protection;
 use pitwall::{PageOptions, PitWallOptions, PitWallServer, Role};
 
 /// Three simulated cars race; a pit wall watches.
@@ -70,6 +71,7 @@ fn run(options: &Options) -> anyhow::Result<()> {
                 listen: vec![options.listen.clone()],
                 discoverable: false,
             },
+            protection: Protection::None,
             page: PageOptions {
                 address: options.page,
                 ..PageOptions::default()

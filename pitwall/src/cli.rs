@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand};
+use keys::{Protection, Role};
 use pitwall::{RecorderOptions, Replay};
 use protocol::{CarName, Pose2, Rates};
 
@@ -27,7 +28,8 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Args)]
 pub(crate) struct Page {
-    /// Address of the page. If it is not a loopback address, the page requires the token that is printed.
+    /// Address of the page. If it is not a loopback address, the page requires the token that is printed. With --keys it is then
+    /// served over HTTPS.
     #[arg(
         long = "page",
         global = true, help_heading = GLOBAL,
@@ -82,7 +84,8 @@ const RECORDING: &str = "Recording";
 const GLOBAL: &str = "Global options";
 
 const EXIT_CODES: &str = "Without --listen and --connect, the program joins the pit wall that runs on this laptop. If none \
-runs, it listens for the cars itself on tcp/0.0.0.0:7447.
+runs, it listens for the cars itself: with --keys on tls/0.0.0.0:7447, with --passphrase-file on tcp/0.0.0.0:7447, and without \
+either on this machine only.
 
 Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict, \
 7 data is lost or missing.";
@@ -95,12 +98,44 @@ pub(crate) struct NetworkOptions {
     /// Connect to a running pit wall or router.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
+    /// Keys of this pit wall or viewer, made by `pitwall keys new` [default: $SYNPF_KEYS]
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
+    keys: Option<PathBuf>,
+    /// File with the passphrase that pit wall and cars share, where there are no keys [default: $SYNPF_PASSPHRASE_FILE]
+    #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE", conflicts_with = "keys")]
+    passphrase_file: Option<PathBuf>,
+    /// Listen on the network without keys and without a passphrase: everybody there can read and command every car.
+    #[arg(long, global = true, help_heading = GLOBAL)]
+    pub(crate) insecure: bool,
     /// Your name, as shown to the others at the pit wall [default: $USER]
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "NAME")]
     operator: Option<String>,
 }
 
 impl NetworkOptions {
+    /// How the network is protected.
+    pub(crate) fn protection(&self) -> Result<Protection, keys::KeyError> {
+        let variable = |name| {
+            std::env::var_os(name)
+                .filter(|value| !value.is_empty())
+                .map(PathBuf::from)
+        };
+        let (keys, passphrase) = match (&self.keys, &self.passphrase_file) {
+            (None, None) => {
+                let keys = variable("SYNPF_KEYS");
+                let passphrase = variable("SYNPF_PASSPHRASE_FILE").filter(|_| keys.is_none());
+                (keys, passphrase)
+            }
+            (keys, passphrase) => (keys.clone(), passphrase.clone()),
+        };
+        Protection::read(
+            keys.as_deref(),
+            passphrase.as_deref(),
+            &[Role::Pit, Role::Viewer, Role::Router],
+            None,
+        )
+    }
+
     /// The operator's name, which every command carries.
     pub(crate) fn operator(&self) -> String {
         let user = || std::env::var("USER").ok().filter(|user| !user.is_empty());
@@ -254,6 +289,34 @@ pub(crate) enum Verb {
         #[arg(short, long, value_name = "FOLDER")]
         output: Option<PathBuf>,
     },
+    /// Make, list, renew and revoke the keys of cars, pit walls and viewers.
+    Keys {
+        /// Folder of the keys [default: synpf/keys in the user's configuration folder]
+        #[arg(long, global = true, value_name = "FOLDER")]
+        folder: Option<PathBuf>,
+        #[command(subcommand)]
+        verb: KeysVerb,
+    },
+    /// Check clock, files, disk, ports, keys and cars, and say what to do. The exit code is 1 if something is bad.
+    Doctor,
+    /// Only pass messages on between cars, pit walls and viewers.
+    Router,
+    /// Exit with 0 if something accepts connections at an address: a container's health check.
+    Health {
+        /// The address.
+        #[arg(value_name = "ADDRESS:PORT")]
+        address: SocketAddr,
+    },
+    /// Start containers of a Compose project again after `docker kill`.
+    #[cfg(unix)]
+    Keep {
+        /// Socket of the Docker daemon.
+        #[arg(long, value_name = "SOCKET", default_value = "/var/run/docker.sock")]
+        socket: PathBuf,
+        /// Name of the Compose project.
+        #[arg(long, value_name = "NAME")]
+        project: String,
+    },
     /// Save what is intact in a damaged recording. The exit code is 7 if something is lost.
     Recover {
         /// The damaged file. It is not changed.
@@ -262,6 +325,78 @@ pub(crate) enum Verb {
         #[arg(short, long, value_name = "FILE")]
         output: Option<PathBuf>,
     },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum KeysVerb {
+    /// Make keys. The first call also makes the authority; without names it makes keys for pit, car-1, car-2, car-3 and viewer.
+    New {
+        #[command(flatten)]
+        owners: Owners,
+        /// Name or address of the pit wall's machine, for the page. May be repeated [default: those of this machine]
+        #[arg(long = "host", value_name = "NAME|ADDRESS")]
+        hosts: Vec<String>,
+        /// Leave keys alone that exist already.
+        #[arg(long)]
+        missing: bool,
+        /// Also write the keys of NAME into this folder, such as one that a container sees.
+        #[arg(long = "copy", value_name = "NAME=FOLDER", value_parser = copy_to)]
+        copies: Vec<(CarName, PathBuf)>,
+        /// Days until the keys expire, 1 to 3650.
+        #[arg(long, value_name = "DAYS", default_value_t = 365, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=3650))]
+        days: u32,
+    },
+    /// Put keys out of force, such as those of a car that was stolen.
+    Revoke {
+        #[command(flatten)]
+        owners: Owners,
+    },
+    /// Replace keys by new ones.
+    Renew {
+        #[command(flatten)]
+        owners: Owners,
+    },
+    /// List all keys and when they expire.
+    List,
+}
+
+/// Whose keys. Each may be repeated.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct Owners {
+    /// A car: publishes under its own name only.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) car: Vec<CarName>,
+    /// A pit wall: listens for cars and commands.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) pit: Vec<CarName>,
+    /// A router: passes messages on and cannot command.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) router: Vec<CarName>,
+    /// A viewer: reads only.
+    #[arg(long, value_name = "NAME")]
+    pub(crate) viewer: Vec<CarName>,
+    /// An operator who logs in to the page with a token of their own.
+    #[arg(long = "token", value_name = "OPERATOR")]
+    pub(crate) tokens: Vec<CarName>,
+}
+
+impl Owners {
+    /// True when nobody is named.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.hosts().next().is_none() && self.tokens.is_empty()
+    }
+
+    /// The owners of certificates.
+    pub(crate) fn hosts(&self) -> impl Iterator<Item = (Role, CarName)> {
+        let with = |role, names: &[CarName]| {
+            let names = names.to_vec();
+            names.into_iter().map(move |name| (role, name))
+        };
+        with(Role::Pit, &self.pit)
+            .chain(with(Role::Car, &self.car))
+            .chain(with(Role::Viewer, &self.viewer))
+            .chain(with(Role::Router, &self.router))
+    }
 }
 
 #[derive(Debug, Subcommand)]
@@ -378,6 +513,15 @@ pub(crate) struct RateOptions {
     /// Publish the full-rate streams for recordings: on or off.
     #[arg(long, value_name = "ON|OFF", value_parser = on_off, action = clap::ArgAction::Set)]
     pub(crate) recorded: Option<bool>,
+}
+
+/// `NAME=FOLDER`.
+fn copy_to(text: &str) -> Result<(CarName, PathBuf), String> {
+    let (name, folder) = text
+        .split_once('=')
+        .ok_or("use NAME=FOLDER, such as car-1=/mnt/car-1")?;
+    let name = CarName::new(name).map_err(|error| error.to_string())?;
+    Ok((name, folder.into()))
 }
 
 /// `30s`, `5m`, `1.5h`, `200ms`, or a bare number of seconds.
@@ -510,6 +654,23 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn owners_of_keys_are_read() {
+        let call =
+            "pitwall keys new --car car-1 --car car-2 --pit pit --token ana --copy pit=/mnt --operator ben";
+        let cli = Cli::try_parse_from(call.split(' ')).expect("valid");
+        let Some(Verb::Keys {
+            verb: KeysVerb::New { owners, copies, .. },
+            ..
+        }) = cli.verb
+        else {
+            panic!("another command");
+        };
+        assert_eq!(owners.hosts().count(), 3);
+        assert_eq!((owners.tokens[0].as_str(), copies.len()), ("ana", 1));
+        assert_eq!(cli.network.operator(), "ben");
     }
 
     #[test]

@@ -258,7 +258,7 @@ mod tests {
             car: format!("car-{number}").parse().expect("a name"),
             payload: EventPayload::Appeared,
         };
-        for round in 0..20 {
+        for round in 0..14 {
             let path = folder.path().join(format!("{round}.mcap"));
             let recorder = Recorder::start(&path).expect("begun");
             let start = Barrier::new(2);

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::Receiver;
+use keys::Protection;
 use protocol::{CarName, Severity};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -24,6 +25,7 @@ use crate::recording::{
 pub struct FleetService {
     connection: Connection,
     bus: Arc<EventBus>,
+    warning: Option<String>,
     periodic_tasks: Mutex<Option<JoinHandle<()>>>,
     /// Cars whose map and info are being fetched. Over a slow link a fetch takes longer than the period of the fetches.
     fetching: Mutex<BTreeSet<CarName>>,
@@ -45,12 +47,19 @@ impl FleetService {
 
     /// Opens the connection. Needs a multi-thread tokio runtime.
     pub async fn open(role: &Role) -> Result<Arc<Self>, ConnectionError> {
+        Self::open_protected(role, &Protection::None).await
+    }
+
+    /// Opens the connection with keys or a passphrase. Needs a multi-thread tokio runtime.
+    pub async fn open_protected(role: &Role, protection: &Protection) -> Result<Arc<Self>, ConnectionError> {
         let bus = Arc::new(EventBus::default());
         let sink = bus.clone();
-        let connection = Connection::open(role, Arc::new(move |event| sink.publish(event))).await?;
+        let connection =
+            Connection::open(role, protection, Arc::new(move |event| sink.publish(event))).await?;
         let service = Arc::new(Self {
             connection,
             bus,
+            warning: exposure(role, protection),
             periodic_tasks: Mutex::default(),
             fetching: Mutex::default(),
             recording_failure: watch::Sender::new(None),
@@ -66,6 +75,11 @@ impl FleetService {
     /// The connection to the cars.
     pub fn connection(&self) -> &Connection {
         &self.connection
+    }
+
+    /// What everybody at this pit wall must know about its network. None when it is protected or stays on this machine.
+    pub fn warning(&self) -> Option<&str> {
+        self.warning.as_deref()
     }
 
     /// Sends queries and commands to the cars.
@@ -295,6 +309,10 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
         let cars: Vec<_> = {
             let mut fleet = service.fleet();
             fleet.tick(unix_now());
+            for flood in service.connection.floods() {
+                let car = Some(flood.car);
+                fleet.add_entry(unix_now(), car, Severity::Warning, "flood", flood.text, None);
+            }
             let alive = fleet.cars().filter(|car| car.alive);
             alive
                 .map(|car| (car.name.clone(), car.map.is_none(), car.info.is_none()))
@@ -351,4 +369,11 @@ pub enum StartRecordingError {
     /// The network.
     #[error(transparent)]
     Connection(#[from] ConnectionError),
+}
+/// The warning of a pit wall that everybody on the network can read and command.
+fn exposure(role: &Role, protection: &Protection) -> Option<String> {
+    let endpoint = role.reachable_endpoint()?;
+    (!protection.protects()).then(|| {
+        format!("unprotected: whoever reaches {endpoint} can read, forge and command every car; see `pitwall keys`")
+    })
 }

@@ -71,8 +71,8 @@ pub use fleet::{
 };
 pub use fleet_service::{FleetService, StartRecordingError};
 pub use network::{
-    CarFiles, Client, Connection, ConnectionError, DEFAULT_LISTEN, LOCAL_PITWALL, REPLY_TIMEOUT, Role,
-    Verdict, new_command_id,
+    CarFiles, Client, Connection, ConnectionError, LOCAL_PITWALL, REPLY_TIMEOUT, Role, Router, Verdict,
+    new_command_id, open_router,
 };
 pub use program::program;
 pub use recording::{
@@ -85,4 +85,4 @@ pub use recording::{
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};
 pub use server::{PitWallError, PitWallOptions, PitWallServer};
-pub use web::{Page, PageOptions};
+pub use web::{Page, PageOptions, disk_free};

@@ -8,7 +8,9 @@ use serde::Serialize;
 
 /// Prints a result.
 pub(crate) fn print(text: &str) {
-    write(&format!("{text}\n"));
+    // Names and texts may come from the network.
+    let lines: Vec<_> = text.split('\n').map(protocol::plain_text).collect();
+    write(&format!("{}\n", lines.join("\n")));
 }
 
 /// Ends the program quietly when the reader is gone, as after `| head`; `println!` would panic.

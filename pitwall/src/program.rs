@@ -20,12 +20,18 @@ pub fn program() -> ExitCode {
         "warn,zenoh=off,zenoh_transport=off"
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(usual));
+    // At debug level zenoh prints its configuration, and with it the password.
+    let filter = match "zenoh::api::session=off".parse() {
+        Ok(quiet) if !screen => filter.add_directive(quiet),
+        _ => filter,
+    };
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .without_time()
         .with_target(false)
         .init();
+    raise_file_limit();
     let outcome = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(2)
         .enable_all()
@@ -41,6 +47,16 @@ pub fn program() -> ExitCode {
         }
     })
 }
+
+/// Takes as many file handles as the system allows. The usual 1024 are few when somebody opens sockets to do harm.
+fn raise_file_limit() {
+    if let Err(error) = rlimit::increase_nofile_limit(FILES) {
+        tracing::debug!(%error, "the limit of open files stays");
+    }
+}
+
+/// Most open files.
+const FILES: u64 = 16_384;
 
 /// Exit code: the command line is invalid.
 const BAD_USAGE: u8 = 2;

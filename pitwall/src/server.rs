@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use keys::Protection;
+
 use crate::fleet_service::FleetService;
 use crate::network::{ConnectionError, Role};
 use crate::web::{Page, PageOptions};
@@ -11,6 +13,8 @@ use crate::web::{Page, PageOptions};
 pub struct PitWallOptions {
     /// How to connect to the cars.
     pub role: Role,
+    /// How the network is protected. With keys, a page beyond loopback is served over HTTPS.
+    pub protection: Protection,
     /// How to serve the page.
     pub page: PageOptions,
 }
@@ -25,8 +29,12 @@ impl PitWallServer {
     /// Opens the connection and serves the page. Needs a multi-thread tokio runtime.
     pub async fn start(options: PitWallOptions) -> Result<Self, PitWallError> {
         let address = options.page.address;
-        let service = FleetService::open(&options.role).await?;
-        match Page::serve(service.clone(), options.page).await {
+        let service = FleetService::open_protected(&options.role, &options.protection).await?;
+        let keys = match &options.protection {
+            Protection::Keys(keys) => Some(keys.clone()),
+            Protection::None | Protection::Passphrase(_) => None,
+        };
+        match Page::serve_with_keys(service.clone(), options.page, keys).await {
             Ok(page) => Ok(Self { service, page }),
             Err(reason) => {
                 service.close().await;

@@ -49,6 +49,8 @@ impl Header {
     pub const LEN: usize = 40;
     /// The first bytes of every message.
     pub const MAGIC: [u8; 4] = *b"SYPF";
+    /// Largest sequence number: a message every microsecond for a hundred thousand years.
+    pub const MAX_SEQUENCE: u64 = 1 << 62;
 
     /// A header for a message of `schema`.
     pub fn new(schema: Schema, version: u16, stamps: Stamps) -> Self {

@@ -43,6 +43,7 @@ mod geometry;
 mod header;
 mod key;
 mod message;
+mod plain_text;
 mod telemetry;
 mod to_car;
 mod to_wall;
@@ -52,6 +53,7 @@ pub use geometry::{Covariance, Pose2, Twist2};
 pub use header::{Header, HeaderError, Stamps};
 pub use key::{CarName, Key, KeyError, Topic};
 pub use message::{Invalid, Message, Schema};
+pub use plain_text::plain_text;
 pub use telemetry::Telemetry;
 pub use to_car::{
     Action, Answer, Candidate, Command, CommandId, FileInfo, FileName, FileNameError, FilesReply,

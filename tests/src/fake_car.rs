@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use car_node::telemetry::replay_buffer::ReplayBuffer;
+use keys::{Protection, Side};
 use pitwall::unix_now;
 use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
@@ -89,8 +90,23 @@ impl FakeCar {
 
     /// Connects to the pit wall at `endpoint` and starts to drive.
     pub async fn start(name: &str, endpoint: &str, behaviour: Behaviour) -> Self {
+        Self::start_protected(name, endpoint, behaviour, &Protection::None).await
+    }
+
+    /// The same with keys or a passphrase.
+    pub async fn start_protected(
+        name: &str,
+        endpoint: &str,
+        behaviour: Behaviour,
+        protection: &Protection,
+    ) -> Self {
         let name = CarName::new(name).expect("a good name");
-        let session = zenoh::open(config(endpoint)).await.expect("a session");
+        let mut config = config(endpoint);
+        let settings = protection.settings(&Side::Car(name.clone())).expect("settings");
+        for (key, value) in &settings.entries {
+            config.insert_json5(key, value).expect("a good setting");
+        }
+        let session = zenoh::open(config).await.expect("a session");
         let run_id = behaviour.run_id.unwrap_or_else(|| unix_now() as u64);
         let state = Arc::new(Mutex::new(CarState {
             published: BTreeMap::new(),

@@ -17,7 +17,7 @@ mod synthetic_bag;
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
 pub use link::Link;
-pub use real_car::{start_real, start_recording};
+pub use real_car::{start_real, start_real_protected, start_recording};
 pub use steal_time::steal_time;
 pub use synthetic_bag::{room, true_pose, write_bag};
 

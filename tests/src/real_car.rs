@@ -7,6 +7,7 @@ use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::recording::RecordOptions;
 use car_node::sensors::Race;
+use keys::Protection;
 use protocol::CarName;
 use simulator::{CarSetup, Track};
 use synpf::TrackMap;
@@ -14,7 +15,7 @@ use synpf::TrackMap;
 /// Starts a car at `start` \[m\] along the line of `club`. It connects to the pit wall at `endpoint` and keeps its state in
 /// the folder `state`.
 pub fn start_real(name: &CarName, start: f64, endpoint: &str, state: Option<&Path>) -> Node {
-    start_recording(name, start, endpoint, state, None)
+    start_with(name, start, endpoint, state, None, Protection::None)
 }
 
 /// The same, and the car records on its own disk into the folder `record`.
@@ -24,6 +25,28 @@ pub fn start_recording(
     endpoint: &str,
     state: Option<&Path>,
     record: Option<&Path>,
+) -> Node {
+    start_with(name, start, endpoint, state, record, Protection::None)
+}
+
+/// The same as [`start_real`], with keys or a passphrase.
+pub fn start_real_protected(
+    name: &CarName,
+    start: f64,
+    endpoint: &str,
+    state: Option<&Path>,
+    protection: Protection,
+) -> Node {
+    start_with(name, start, endpoint, state, None, protection)
+}
+
+fn start_with(
+    name: &CarName,
+    start: f64,
+    endpoint: &str,
+    state: Option<&Path>,
+    record: Option<&Path>,
+    protection: Protection,
 ) -> Node {
     let track = Track::find("club", None).expect("bundled");
     let map = RaceMap {
@@ -39,6 +62,7 @@ pub fn start_recording(
     let mut config = NodeConfig::new(name.clone(), map, Box::new(race.car(0)));
     config.start = Start::Truth;
     config.connect = vec![endpoint.to_owned()];
+    config.protection = protection;
     config.state = state.map(Path::to_owned);
     config.record = record.map(|folder| RecordOptions::new(folder.to_owned(), true));
     Node::start(config).expect("a car")

@@ -34,6 +34,7 @@ impl TestBench {
         let recordings = tempfile::tempdir().expect("a folder");
         let server = PitWallServer::start(PitWallOptions {
             role: router(&endpoint),
+            protection: keys::Protection::None,
             page: PageOptions {
                 address: ([127, 0, 0, 1], 0).into(),
                 recordings: recordings.path().to_owned(),

@@ -71,10 +71,12 @@ fn garbage() -> Vec<Vec<u8>> {
 }
 
 /// Topics that a car receives.
-const TO_CAR: [Topic; 8] = [
+const TO_CAR: [Topic; 10] = [
     Topic::Clock,
     Topic::Link,
     Topic::Missing,
+    Topic::Files,
+    Topic::CmdRecord,
     Topic::CmdParams,
     Topic::CmdPose,
     Topic::CmdRelocalize,

@@ -10,8 +10,10 @@ macro_rules! say {
 }
 
 pub(crate) mod ablate;
+pub(crate) mod doctor;
 mod drawing;
 pub(crate) mod evaluate;
+pub(crate) mod health;
 pub(crate) mod import;
 pub(crate) mod placement;
 pub(crate) mod race;

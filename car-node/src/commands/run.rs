@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow, bail};
 use car_node::localization::Start;
+use car_node::node::exposure;
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::recording::RecordOptions;
 use car_node::ros2::graph::RosNode;
@@ -16,11 +17,13 @@ use car_node::ros2::services;
 use car_node::ros2::topics;
 use car_node::sensors::{BagPlayer, Race, Ros2, Ros2Options, Source};
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
+use keys::{Protection, Role};
 use maps::{OccupancyGrid, Raceline};
 use protocol::CarName;
 use simulator::{CarSetup, Grip, OdometryParams, YawSource};
 use synpf::{TablePolicy, TrackMap};
 
+use super::health::Heartbeat;
 use crate::cli::{Odometry, Run, SourceKind};
 
 /// Time after the last message of a bag for the pit wall to recover gaps.
@@ -33,6 +36,8 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let car = name(arguments)?;
     super::placement::place(arguments.cpus.as_deref(), arguments.priority)?;
     let signal = signals()?;
+    // First: wrong keys should show before a bag is read.
+    let protection = protection(arguments, &car)?;
     let (mut ros, mut ros_sink) = (None, None);
     let (map, source, start): (_, Box<dyn Source>, _) = match (arguments.source, &arguments.bag) {
         (SourceKind::Bag, Some(bag)) => {
@@ -88,6 +93,11 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     config.seed = arguments.seed;
     config.rate = arguments.rate;
     config.connect.clone_from(&arguments.connect);
+    config.search = protection.protects() || arguments.insecure;
+    if let Some(text) = exposure(&config.connect, &protection, config.search) {
+        eprintln!("{car}: warning: {text}");
+    }
+    config.protection = protection;
     config.rates.recorded = !arguments.no_recorded;
     config.predict = arguments.predict;
     config.ros = ros_sink;
@@ -96,17 +106,20 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         .clone()
         .or_else(|| default_state_folder(car.as_str()));
     config.record = record_options(arguments, config.state.as_deref());
+    let searches = config.search;
+    let state = config.state.clone();
     let node = Node::start(config)?;
     let _services = ros
         .map(|(connection, ros_node)| ros_services(&connection, &ros_node, &node))
         .transpose()?;
     let wall = if arguments.connect.is_empty() {
-        "a pit wall on this machine or nearby".to_owned()
+        let nearby = if searches { " or nearby" } else { "" };
+        format!("a pit wall on this machine{nearby}")
     } else {
         arguments.connect.join(", ")
     };
     eprintln!("{car}: {description}; connects to {wall}. Ctrl-C ends it.");
-    let reason = wait(&node, &signal, arguments.stay);
+    let reason = wait(&node, &signal, arguments.stay, Heartbeat::new(state.as_deref()));
     let estimate = node.shared().latest_pose();
     node.shutdown(reason);
     match estimate {
@@ -139,6 +152,38 @@ fn record_options(arguments: &Run, state: Option<&Path>) -> Option<RecordOptions
         split: arguments.record_split.0,
         start,
     })
+}
+
+/// The keys or the passphrase of the command line.
+fn protection(arguments: &Run, car: &CarName) -> anyhow::Result<Protection> {
+    let variable = |name| {
+        env::var_os(name)
+            .filter(|value| !value.is_empty())
+            .map(PathBuf::from)
+    };
+    let (keys, passphrase) = match (&arguments.keys, &arguments.passphrase_file) {
+        (None, None) => {
+            let keys = variable("SYNPF_KEYS");
+            let passphrase = variable("SYNPF_PASSPHRASE_FILE").filter(|_| keys.is_none());
+            (keys, passphrase)
+        }
+        (keys, passphrase) => (keys.clone(), passphrase.clone()),
+    };
+    let protection = Protection::read(keys.as_deref(), passphrase.as_deref(), &[Role::Car], Some(car))?;
+    for endpoint in &arguments.connect {
+        protection.check_endpoint(endpoint).map_err(super::BadUsage)?;
+    }
+    if let Some(file) = keys
+        .iter()
+        .chain(&passphrase)
+        .find(|file| keys::open_to_others(file))
+    {
+        eprintln!(
+            "{car}: warning: others on this machine can read {}; chmod 600 it",
+            file.display()
+        );
+    }
+    Ok(protection)
 }
 
 /// Finds the live sensors. Prints what is missing while it waits.
@@ -208,7 +253,7 @@ fn ros_services(connection: &RosConnection, ros_node: &RosNode, node: &Node) -> 
 }
 
 /// Waits for the end of the node, and returns the reason.
-fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static str {
+fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool, mut heartbeat: Heartbeat) -> &'static str {
     let mut ended = None;
     loop {
         match signal.recv_timeout(Duration::from_millis(50)) {
@@ -216,6 +261,8 @@ fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool) -> &'static st
             Err(RecvTimeoutError::Disconnected) => return "the signal handler ended",
             Err(RecvTimeoutError::Timeout) => {}
         }
+        let estimate = node.shared().latest_pose().map(|estimate| estimate.stamp);
+        heartbeat.beat(estimate, node.source_ended());
         if !stay && node.source_ended() && ended.get_or_insert_with(Instant::now).elapsed() > LINGER {
             return "end of the bag";
         }

@@ -1,9 +1,11 @@
-//! The thread that receives commands off the network, has the [`CommandHandler`] execute them, and replies.
+//! The thread that receives commands off the network, checks who sent them, has the [`CommandHandler`] execute them, and
+//! replies.
 
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use crossbeam_channel::{Receiver, select};
+use keys::Verifier;
 use zenoh::Wait;
 
 use super::command_handler::{CommandHandler, CommandHandlerConfig};
@@ -13,9 +15,10 @@ use super::request::Request;
 /// The handler's deadlines are checked this often.
 const TICK: Duration = Duration::from_millis(50);
 
-/// Starts the thread. It ends when `stop` is dropped.
+/// Starts the thread. With a verifier only signed commands are executed. It ends when `stop` is dropped.
 pub fn start(
     config: CommandHandlerConfig,
+    verifier: Option<Verifier>,
     requests: Receiver<Request>,
     mut local: Receiver<LocalRequest>,
     stop: Receiver<()>,
@@ -23,12 +26,13 @@ pub fn start(
     thread::Builder::new()
         .name("command-server".into())
         .spawn(move || {
+            let run_id = config.run_id;
             let mut handler = CommandHandler::new(config);
             loop {
                 select! {
                     recv(stop) -> _ => return,
                     recv(requests) -> request => match request {
-                        Ok(request) => serve(&mut handler, &request),
+                        Ok(request) => serve(&mut handler, verifier.as_ref(), run_id, &request),
                         Err(_) => return,
                     },
                     recv(local) -> request => match request {
@@ -45,7 +49,7 @@ pub fn start(
         })
 }
 
-fn serve(handler: &mut CommandHandler, request: &Request) {
+fn serve(handler: &mut CommandHandler, verifier: Option<&Verifier>, run_id: u64, request: &Request) {
     let Request { topic, query } = request;
     let payload = query.payload().map(|payload| payload.to_bytes());
     // A wildcard would reach every car at once.
@@ -53,7 +57,12 @@ fn serve(handler: &mut CommandHandler, request: &Request) {
         let error = "a command needs the key of one car, without wildcards";
         Err(handler.count_unreadable(*topic, error.into()))
     } else {
-        handler.answer(*topic, payload.as_deref())
+        let signer = verifier.map(|verifier| {
+            let signature = query.attachment().map(|attachment| attachment.to_bytes());
+            let command = payload.as_deref().unwrap_or_default();
+            verifier.check(signature.as_deref(), query.key_expr().as_str(), run_id, command)
+        });
+        handler.answer_signed(*topic, payload.as_deref(), signer.transpose())
     };
     let sent = match answer {
         Ok(bytes) => query.reply(query.key_expr().clone(), bytes).wait(),

@@ -16,6 +16,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use crossbeam_channel::{Sender, bounded};
+use keys::Protection;
 use maps::{Pose, Raceline};
 use protocol::{CarInfo, CarName, EventKind, Rates, Stamps, encode};
 use synpf::{Localizer, PoseError, SetUpError, TrackMap};
@@ -77,9 +78,12 @@ pub struct NodeConfig {
     pub start: Start,
     /// Seed of the filter.
     pub seed: u64,
-    /// Endpoints of pit walls, such as `tcp/192.168.1.10:7447`. Without one, the car looks for a pit wall on this machine and,
-    /// by multicast, on the local network.
+    /// Endpoints of pit walls, such as `tcp/192.168.1.10:7447`. Without one, the car looks for a pit wall on this machine.
     pub connect: Vec<String>,
+    /// How the network is protected.
+    pub protection: Protection,
+    /// Without an endpoint, look for a pit wall by multicast, too.
+    pub search: bool,
     /// How often each topic is sent.
     pub rates: Rates,
     /// Send predicted poses at odometry rate, and not only poses at scan rate.
@@ -107,6 +111,8 @@ impl NodeConfig {
             start: Start::Truth,
             seed: 0,
             connect: Vec::new(),
+            protection: Protection::None,
+            search: false,
             rates: DEFAULT_RATES,
             predict: false,
             thresholds: Thresholds::default(),
@@ -201,6 +207,8 @@ impl Node {
             start,
             seed,
             connect,
+            protection,
+            search,
             rates,
             predict,
             thresholds,
@@ -227,7 +235,10 @@ impl Node {
         set.parameters.prepare_tables(&map.map, known);
         let starts_with_a_pose = start_at(localizer.as_mut(), start, source.start())?;
 
-        let session = network::open(&connect)?;
+        let verifier = protection
+            .verifier()
+            .map_err(|error| NodeError::Network(NetworkError::Keys(error)))?;
+        let session = network::open(&car, &connect, &protection, search)?;
         let started = wall_now();
         let run_id = run_id::next(state.as_deref(), started);
         let clock = source.clock(rate);
@@ -295,6 +306,9 @@ impl Node {
             None,
             None,
         );
+        if let Some(text) = exposure(&connect, &protection, search) {
+            shared.event(clock.now(), 0, EventKind::Warning { text }, None, None);
+        }
         let publisher = publisher.start(publisher_stops)?;
         let mut monitor = Monitor::new(thresholds, clock.now());
         if starts_with_a_pose {
@@ -357,6 +371,7 @@ impl Node {
                 track_map: map.map,
                 search_patience: SEARCH_PATIENCE,
             },
+            verifier,
             command_requests,
             local_requests,
             control_stops.clone(),
@@ -470,6 +485,19 @@ impl Node {
         drop(self.alive);
         network::close(&self.session, CLOSING);
     }
+}
+
+/// What everybody must know about the car's network; None when it is protected or stays on this machine.
+pub fn exposure(connect: &[String], protection: &Protection, search: bool) -> Option<String> {
+    if protection.protects() {
+        return None;
+    }
+    let remote = network::remote_endpoint(connect);
+    let anywhere = (search && connect.is_empty()).then_some("a pit wall found by multicast");
+    let wall = remote.or(anywhere)?;
+    Some(format!(
+        "the link to {wall} is unprotected: others on the network can read this car's telemetry and command it"
+    ))
 }
 
 fn join(thread: JoinHandle<()>) {

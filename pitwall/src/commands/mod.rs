@@ -3,14 +3,20 @@
 mod cars;
 mod check;
 mod control;
+mod doctor;
 mod events;
 mod export;
 mod fetch;
+mod health;
+#[cfg(unix)]
+mod keep;
+mod keys;
 mod merge;
 mod params;
 mod record;
 mod replay;
 mod report;
+mod router;
 mod serve;
 mod sessions;
 mod watch;
@@ -19,6 +25,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ::keys::Protection;
 use pitwall::{FleetService, PageOptions, Role, Unreadable};
 use protocol::{Action, CarName, RecordAction};
 
@@ -85,24 +92,81 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             rebuild,
         } => sessions::run(&folder, &words, rebuild, json),
         Verb::Replay { file, speed, at } => {
+            let keys = match network.protection()? {
+                Protection::Keys(keys) => Some(keys),
+                Protection::None | Protection::Passphrase(_) => None,
+            };
             let options = PageOptions {
                 address: page.address,
                 recordings: page.recordings,
                 ..PageOptions::default()
             };
-            replay::run(&file, options, speed, at.as_secs_f64(), json).await
+            replay::run(&file, options, keys, speed, at.as_secs_f64(), json).await
         }
         Verb::Report { file, output, with } => report::run(&file, output, &with, json),
         Verb::Check { file } => check::run(&file, json),
         Verb::Export { file, output } => export::run(&file, output, json),
+        Verb::Doctor => doctor::run(&network, &page, json).await,
+        Verb::Router => router::run(&network, json).await,
+        Verb::Health { address } => health::run(address),
+        #[cfg(unix)]
+        Verb::Keep { socket, project } => keep::run(&socket, &project).await,
+        Verb::Keys { folder, verb } => keys::run(folder, &verb, json),
         Verb::Recover { file, output } => record::recover(&file, output, json),
     }
 }
 
 async fn open(options: &NetworkOptions) -> anyhow::Result<Arc<FleetService>> {
-    let role = Role::choose(&options.listen, &options.connect);
+    let (role, protection) = link(options)?;
     tracing::info!("{role}");
-    Ok(FleetService::open(&role).await?)
+    Ok(FleetService::open_protected(&role, &protection).await?)
+}
+
+/// How to connect, and how that is protected. Refuses to listen on a network without protection, unless that is wanted.
+fn link(options: &NetworkOptions) -> anyhow::Result<(Role, Protection)> {
+    let protection = options.protection()?;
+    let role = Role::choose(&options.listen, &options.connect, &protection, options.insecure);
+    for endpoint in role.endpoints() {
+        protection.check_endpoint(endpoint).map_err(BadUsage)?;
+    }
+    if let Protection::Keys(keys) = &protection {
+        let listens = matches!(role, Role::Router { .. });
+        if listens && !matches!(keys.role, ::keys::Role::Pit | ::keys::Role::Router) {
+            let text = format!(
+                "the keys of {} {} cannot listen for cars: give --connect, or the keys of a pit wall",
+                keys.role, keys.name
+            );
+            return Err(BadUsage(text).into());
+        }
+        warn_of_expiry(keys);
+    }
+    if let (Protection::None, false, Some(endpoint)) =
+        (&protection, options.insecure, role.reachable_endpoint())
+    {
+        let text = format!(
+            "on {endpoint} everybody on the network could read and command every car: give --keys FILE (`pitwall keys new`), \
+             --passphrase-file FILE, or --insecure"
+        );
+        return Err(BadUsage(text).into());
+    }
+    Ok((role, protection))
+}
+
+/// Says that keys expire soon, or are not in force any more.
+fn warn_of_expiry(keys: &::keys::Bundle) {
+    let host = format!("{} {}", keys.role, keys.name);
+    match keys.days_left(pitwall::unix_now() / 1_000_000_000) {
+        None => output::print_error(&format!(
+            "the keys of {host} are not in force: they were revoked or renewed"
+        )),
+        Some(days) if days < 0 => output::print_error(&format!(
+            "the keys of {host} have expired; `pitwall keys renew` replaces them"
+        )),
+        Some(days) if days < 14 => output::print_note(&format!(
+            "the keys of {host} expire in {days} days; `pitwall keys renew` replaces them"
+        )),
+        Some(_) => {}
+    }
 }
 
 /// Waits for a car, and prints a note when that takes long, because the laptop is often started first. False when the car is

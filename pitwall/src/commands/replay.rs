@@ -2,7 +2,9 @@
 
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 
+use keys::Bundle;
 use pitwall::{Page, PageOptions, Replay};
 use serde_json::json;
 
@@ -12,6 +14,7 @@ use crate::output;
 pub(super) async fn run(
     file: &Path,
     options: PageOptions,
+    keys: Option<Arc<Bundle>>,
     speed: f64,
     at_s: f64,
     json: bool,
@@ -23,7 +26,7 @@ pub(super) async fn run(
         .set_playback(None, Some(speed), (at_s != 0.0).then_some(at_s))
         .map_err(|fault| anyhow::anyhow!("{fault}"))?;
     let address = options.address;
-    let page = Page::serve_replay(replay.clone(), options)
+    let page = Page::serve_replay_with_keys(replay.clone(), options, keys)
         .await
         .map_err(|error| anyhow::anyhow!("cannot serve the page at {address}: {error}"))?;
     let duration = replay.view().duration_s;

@@ -2,28 +2,45 @@
 
 use std::process::ExitCode;
 
+use keys::Protection;
 use pitwall::{PageOptions, PitWallOptions, PitWallServer, Role};
 use serde_json::json;
 
-use super::interrupted;
+use super::{interrupted, link};
 use crate::cli::{NetworkOptions, Page};
 use crate::output;
 
 pub(super) async fn run(network: &NetworkOptions, page: Page, json: bool) -> anyhow::Result<ExitCode> {
-    let role = Role::choose(&network.listen, &network.connect);
+    let (role, protection) = link(network)?;
     let how = role.to_string();
     let options = PageOptions {
         address: page.address,
         recordings: page.recordings.clone(),
         recorder: page.recorder.options(network.operator()),
     };
-    let server = PitWallServer::start(PitWallOptions { role, page: options }).await?;
+    let unprotected = matches!(protection, Protection::None);
+    let listens = matches!(role, Role::Router { .. });
+    let server = PitWallServer::start(PitWallOptions {
+        role,
+        protection,
+        page: options,
+    })
+    .await?;
     #[cfg(feature = "rerun")]
     let views = rerun_views(&server, &page)?;
     if json {
-        output::print_json(&json!({"page": server.url(), "link": how}))?;
+        output::print_json(
+            &json!({"page": server.url(), "link": how, "warning": server.service().warning()}),
+        )?;
     } else {
         output::print(&format!("pit wall: {}\n{how}; Ctrl-C stops it", server.url()));
+    }
+    if let Some(warning) = server.service().warning() {
+        output::print_error(&format!("warning: {warning}"));
+    } else if unprotected && listens && !json {
+        output::print_note(
+            "without keys, cars on this machine only; `pitwall keys new` makes keys for others, see docs/security.md",
+        );
     }
     interrupted().await;
     #[cfg(feature = "rerun")]

@@ -73,6 +73,8 @@ pub struct Car {
     health_profile: HealthProfile,
     clock: Option<ClockEstimate>,
     pub(super) streams: BTreeMap<Topic, StreamStatistics>,
+    /// True when a readable message has come: there is more to it than a name.
+    pub(super) heard: bool,
 }
 
 impl Car {
@@ -119,6 +121,7 @@ impl Car {
             health_profile: HealthProfile::default(),
             clock: None,
             streams: BTreeMap::new(),
+            heard: false,
         }
     }
 

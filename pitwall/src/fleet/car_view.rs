@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{CarInfo, CarName, Health, Load, Shadow, State};
+use protocol::{CarInfo, CarName, Health, Load, Shadow, State, plain_text};
 use serde::Serialize;
 
 use super::car::Car;
@@ -100,6 +100,7 @@ impl Car {
         if self.two_senders(now) {
             causes.insert(0, Rejection::TwoSenders.to_string());
         }
+        let causes = causes.iter().map(|cause| plain(cause)).collect();
         let best = self.best_lap();
         let streams = self.streams.iter().map(|(topic, stream)| {
             let gaps = stream.gaps();
@@ -133,12 +134,12 @@ impl Car {
                 age_s: seconds(now + offset - header.sensor),
             }),
             set: self.params.as_ref().map(|params| SetView {
-                name: params.set.name.clone(),
+                name: plain(&params.set.name),
                 revision: params.revision,
-                who: params.who.clone(),
+                who: plain(&params.who),
                 when: params.when,
-                available: params.available.clone(),
-                reverts_to: params.pending_revert.as_ref().map(|revert| revert.to.clone()),
+                available: params.available.iter().map(|set| plain(set)).collect(),
+                reverts_to: params.pending_revert.as_ref().map(|revert| plain(&revert.to)),
                 reverts_in_s: params
                     .pending_revert
                     .as_ref()
@@ -162,10 +163,21 @@ impl Car {
             run_sheet: self
                 .run_sheet
                 .as_ref()
-                .map(|(_, text)| text.trim_start_matches(Self::RUN_SHEET).to_owned()),
-            info: self.info.clone(),
+                .map(|(_, text)| plain(text.trim_start_matches(Self::RUN_SHEET))),
+            info: self.info.as_ref().map(|info| CarInfo {
+                version: plain(&info.version),
+                source: plain(&info.source),
+                map: plain(&info.map),
+                host: plain(&info.host),
+                ..info.clone()
+            }),
         }
     }
+}
+
+/// Text of the car, made safe to show.
+fn plain(text: &str) -> String {
+    plain_text(text).into_owned()
 }
 
 /// A pose, ready to be shown.

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use protocol::{CarName, Severity};
+use protocol::{CarName, Severity, plain_text};
 use serde::Serialize;
 
 /// One entry of the log.
@@ -44,6 +44,8 @@ impl Log {
     pub fn push(&mut self, mut entry: LogEntry) {
         self.count += 1;
         entry.number = self.count;
+        entry.text = plain_text(&entry.text).into_owned();
+        entry.who = entry.who.map(|who| plain_text(&who).into_owned());
         if self.entries.len() == Self::MAX_ENTRIES {
             self.entries.pop_front();
         }

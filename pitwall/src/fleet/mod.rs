@@ -13,7 +13,7 @@ mod stream_statistics;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use protocol::{CarName, Event, EventKind, Header, Severity, Telemetry, Topic};
+use protocol::{CarName, Event, EventKind, Header, MapReply, Severity, Telemetry, Topic};
 
 use crate::event::{EventPayload, FleetEvent, Rejection};
 
@@ -26,6 +26,10 @@ pub use log::{Log, LogEntry};
 pub use sequence_tracker::{GapSummary, SequenceStatus, SequenceTracker};
 pub use stream_statistics::{StreamStatistics, StreamView};
 
+type SharedMap = Arc<MapReply>;
+/// A map, and the message that it came in.
+type KeptMap = (SharedMap, Arc<[u8]>);
+
 /// The state of all cars, and the log.
 ///
 /// A live pit wall and a replay do the same: [`Fleet::apply`] for each event, [`Fleet::tick`] as time passes.
@@ -37,9 +41,18 @@ pub struct Fleet {
     log: Log,
     /// The engineer's limits by track, see `TrackLine::key`.
     limits: BTreeMap<String, Limits>,
+    /// When cars beyond the limit were last reported \[unix ns\].
+    too_many_reported: Option<i64>,
 }
 
 impl Fleet {
+    /// Most cars that are kept.
+    pub const MOST_CARS: usize = 300;
+    /// Most bytes of maps that are kept. Cars with the same map share it.
+    const MOST_MAP_BYTES: usize = 256_000_000;
+    /// Period of the report that there are too many cars \[ns\].
+    const REPORT_TOO_MANY: i64 = 60_000_000_000;
+
     /// Applies an event.
     pub fn apply(&mut self, event: &FleetEvent) {
         let FleetEvent {
@@ -48,6 +61,13 @@ impl Fleet {
             payload,
         } = event;
         let at = *at;
+        if !self.make_room(name, payload, at) {
+            return;
+        }
+        let map = match payload {
+            EventPayload::Map { map, bytes } => self.share_map(name, map, bytes, at),
+            _ => None,
+        };
         let car = self.cars.entry(name.clone()).or_insert_with(|| {
             let mut car = Car::new(name.clone(), at);
             if let Some((complete, laps_since)) = self.expected.get(name) {
@@ -61,13 +81,21 @@ impl Fleet {
                 car.dismissed = false;
                 car.last_heard = car.last_heard.max(at);
             }
-            EventPayload::Vanished => car.alive = false,
+            EventPayload::Vanished => {
+                car.alive = false;
+                // Nothing is known of it but its name, which cost nothing to invent.
+                if !car.heard {
+                    self.cars.remove(name);
+                    return;
+                }
+            }
             EventPayload::Message {
                 topic,
                 header,
                 telemetry,
                 ..
             } => {
+                car.heard = true;
                 let is_new = car.apply(*topic, header, telemetry, at);
                 let raised = if is_new && *topic == Topic::Health {
                     car.beyond_limits(&self.limits, header.sensor)
@@ -120,7 +148,11 @@ impl Fleet {
                     self.add_entry(at, Some(name.clone()), severity, "identity", text, None);
                 }
             }
-            EventPayload::Map { map, bytes } => car.set_map(Arc::clone(map), Arc::clone(bytes)),
+            EventPayload::Map { .. } => {
+                if let Some((map, bytes)) = map {
+                    car.set_map(map, bytes);
+                }
+            }
             EventPayload::Info(info) => car.info = Some(info.clone()),
             EventPayload::Marker { who, text } => {
                 if text.starts_with(Car::RUN_SHEET) {
@@ -261,6 +293,61 @@ impl Fleet {
     /// The log.
     pub fn log(&self) -> &Log {
         &self.log
+    }
+
+    /// True when the car is known, or can be added. A car that has sent nothing readable makes room for one that has.
+    fn make_room(&mut self, name: &CarName, payload: &EventPayload, at: i64) -> bool {
+        if self.cars.len() < Self::MOST_CARS || self.cars.contains_key(name) {
+            return true;
+        }
+        if let EventPayload::Message { .. } = payload {
+            let gone = |car: &&Car| !car.heard || !car.alive;
+            let oldest = self
+                .cars
+                .values()
+                .filter(gone)
+                .min_by_key(|car| (car.heard, car.last_heard));
+            if let Some(oldest) = oldest.map(|car| car.name.clone()) {
+                self.cars.remove(&oldest);
+                return true;
+            }
+        }
+        if self
+            .too_many_reported
+            .is_none_or(|reported| at - reported >= Self::REPORT_TOO_MANY)
+        {
+            self.too_many_reported = Some(at);
+            let text = format!(
+                "more than {} cars: {name} and others are ignored",
+                Self::MOST_CARS
+            );
+            self.add_entry(at, None, Severity::Warning, "limit", text, None);
+        }
+        false
+    }
+
+    /// The map to keep for a car: the same map of another car, if there is one. None when there is no room for it.
+    fn share_map(&mut self, name: &CarName, map: &SharedMap, bytes: &Arc<[u8]>, at: i64) -> Option<KeptMap> {
+        let maps = || self.cars.values().filter_map(|car| car.map.as_ref());
+        let body = |bytes: &[u8]| bytes.get(Header::LEN..).unwrap_or_default().to_vec();
+        let same = maps().find(|(_, known)| known.len() == bytes.len() && body(known) == body(bytes));
+        if let Some(same) = same {
+            return Some(same.clone());
+        }
+        let mut kept: Vec<_> = maps().map(|(_, bytes)| bytes).collect();
+        kept.sort_by_key(|bytes| Arc::as_ptr(bytes).addr());
+        kept.dedup_by(|a, b| Arc::ptr_eq(a, b));
+        let kept: usize = kept.iter().map(|bytes| bytes.len()).sum();
+        if kept + bytes.len() <= Self::MOST_MAP_BYTES {
+            return Some((Arc::clone(map), Arc::clone(bytes)));
+        }
+        let text = format!(
+            "no room for its map of {:.1} MB: maps may take {:.0} MB in all",
+            bytes.len() as f64 / 1e6,
+            Self::MOST_MAP_BYTES as f64 / 1e6
+        );
+        self.add_entry(at, Some(name.clone()), Severity::Warning, "limit", text, None);
+        None
     }
 
     /// Logs once when a car becomes BLIND, and once when it is back.

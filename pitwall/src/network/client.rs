@@ -5,13 +5,15 @@ use std::hash::{BuildHasher, Hasher};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use keys::{Protection, Role, Signer};
 use protocol::{
-    Action, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, FilesReply,
-    FilesRequest, Header, Key, LinkReport, MapReply, Message, Topic, decode, encode,
+    Action, Answer, CarInfo, CarName, ClockReply, ClockRequest, CodecError, Command, CommandId, FilesReply,
+    FilesRequest, Header, Key, LinkReport, MapReply, Message, Outcome, SetRef, Topic, decode, encode,
 };
 use tokio::sync::mpsc;
 use zenoh::qos::Priority;
 
+use super::error::ConnectionError;
 use super::marker;
 use super::query::{CONGESTION, OPERATOR_PRIORITY, first_reply, query, stamps};
 use super::verdict::Verdict;
@@ -59,12 +61,24 @@ impl FileSource for CarFiles<'_> {
 pub struct Client {
     session: zenoh::Session,
     sink: EventSink,
+    signer: Option<Signer>,
+    /// True for the keys of a viewer, to whose commands no car listens.
+    viewer: bool,
 }
 
 impl Client {
     /// What the queries find out goes to `sink` as events.
-    pub(super) fn new(session: zenoh::Session, sink: EventSink) -> Self {
-        Self { session, sink }
+    pub(super) fn new(
+        session: zenoh::Session,
+        protection: &Protection,
+        sink: EventSink,
+    ) -> Result<Self, ConnectionError> {
+        Ok(Self {
+            session,
+            sink,
+            signer: protection.signer().map_err(ConnectionError::Keys)?,
+            viewer: matches!(protection, Protection::Keys(keys) if keys.role == Role::Viewer),
+        })
     }
 
     /// Sends a new command to a car and waits for the answer.
@@ -94,6 +108,26 @@ impl Client {
     ) -> Result<Verdict, CodecError> {
         let begun = Instant::now();
         let bytes = encode(command, stamps())?;
+        if self.viewer {
+            return Ok(not_allowed(
+                command,
+                "these keys are a viewer's: they may read, not command",
+            ));
+        }
+        let signature = match &self.signer {
+            Some(signer) => match self.sign(signer, car, command, &bytes, timeout).await {
+                Ok(signature) => Some(signature),
+                Err(Some(error)) => return Ok(not_allowed(command, &error)),
+                Err(None) if self.alive(car).await => {
+                    return Ok(Verdict::NoAnswer {
+                        waited_s: begun.elapsed().as_secs_f64(),
+                        gone: false,
+                    });
+                }
+                Err(None) => return Ok(Verdict::NoSuchCar),
+            },
+            None => None,
+        };
         // On a slow link, the answer to one copy may come after the next copy was sent.
         let (sender, mut replies) = mpsc::unbounded_channel();
         let (mut was_alive, mut alive) = (false, true);
@@ -105,6 +139,7 @@ impl Client {
                 car,
                 command.action.topic(),
                 bytes.clone(),
+                signature.clone(),
                 left,
                 OPERATOR_PRIORITY,
                 &sender,
@@ -136,6 +171,51 @@ impl Client {
                 return Ok(Verdict::NoSuchCar);
             }
         }
+    }
+
+    /// Signs a command for the car's present run. The error is None when the car does not answer.
+    async fn sign(
+        &self,
+        signer: &Signer,
+        car: &CarName,
+        command: &Command,
+        bytes: &[u8],
+        timeout: Duration,
+    ) -> Result<Vec<u8>, Option<String>> {
+        let begun = Instant::now();
+        let patience = ABSENT_AFTER.min(timeout);
+        let run_id = loop {
+            let Ok(request) = encode(&ClockRequest { sent: unix_now() }, stamps()) else {
+                return Err(None);
+            };
+            let (sender, mut replies) = mpsc::unbounded_channel();
+            let left = patience.saturating_sub(begun.elapsed()).max(RESEND_AFTER);
+            query(
+                &self.session,
+                car,
+                Topic::Clock,
+                request,
+                None,
+                left,
+                OPERATOR_PRIORITY,
+                &sender,
+            )
+            .await;
+            drop(sender);
+            let reply = tokio::time::timeout(RESEND_AFTER, replies.recv())
+                .await
+                .ok()
+                .flatten();
+            if let Some(Ok((header, _))) = reply.map(|bytes| decode::<ClockReply>(&bytes)) {
+                break header.run_id;
+            }
+            if begun.elapsed() >= patience {
+                return Err(None);
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        };
+        let key = Key::new(car.clone(), command.action.topic()).to_string();
+        signer.sign(&key, run_id, bytes).map_err(Some)
     }
 
     /// True when the car's node runs, checked after `delay`.
@@ -272,5 +352,22 @@ impl Client {
             .inspect_err(|error| tracing::debug!(%car, %error, "the reply cannot be decoded"))
             .map(|(_, message)| message)
             .ok()
+    }
+}
+
+/// The verdict on a command that is refused before it is sent.
+fn not_allowed(command: &Command, why: &str) -> Verdict {
+    Verdict::Answered {
+        answer: Answer {
+            id: command.id,
+            outcome: Outcome::Refused {
+                faults: vec![why.to_owned()],
+            },
+            set: SetRef {
+                name: String::new(),
+                revision: 0,
+            },
+        },
+        after_s: 0.0,
     }
 }

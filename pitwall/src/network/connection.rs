@@ -4,10 +4,12 @@
 //! on the same laptop joins that router as a client. zenoh's threads only note when a message arrived and queue it,
 //! because a slow callback loses messages. The decoder's thread does the rest.
 
-use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use crossbeam_channel::Sender;
+use keys::Protection;
 use protocol::{Key, Topic};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -17,6 +19,7 @@ use zenoh::sample::{Sample, SampleKind};
 use super::client::Client;
 use super::decoder::{Decoder, DecoderInput, send_missing_queries};
 use super::error::ConnectionError;
+use super::flood_limit::{Flood, FloodLimit};
 use super::gap_recovery::Outstanding;
 use super::marker;
 use super::role::Role;
@@ -34,6 +37,7 @@ pub struct Connection {
     _live: Vec<Box<dyn Send + Sync>>,
     recorded: Mutex<Vec<Subscriber<()>>>,
     missing_queries: JoinHandle<()>,
+    floods: Arc<Mutex<FloodLimit>>,
 }
 
 impl Drop for Connection {
@@ -45,10 +49,19 @@ impl Drop for Connection {
 impl Connection {
     /// Opens the connection and subscribes to every topic but the full-rate ones ([`Connection::subscribe_recorded`]).
     /// Needs a multi-thread tokio runtime. `sink` receives every event.
-    pub async fn open(role: &Role, sink: EventSink) -> Result<Self, ConnectionError> {
-        let session = zenoh::open(role.config()?)
-            .await
-            .map_err(|e| role.open_error(&e))?;
+    pub async fn open(
+        role: &Role,
+        protection: &Protection,
+        sink: EventSink,
+    ) -> Result<Self, ConnectionError> {
+        for endpoint in role.endpoints() {
+            protection
+                .check_endpoint(endpoint)
+                .map_err(ConnectionError::Endpoint)?;
+        }
+        let (config, settings) = role.config(protection)?;
+        let session = zenoh::open(config).await.map_err(|e| role.open_error(&e))?;
+        drop(settings);
         let (inputs, queue) = crossbeam_channel::bounded(QUEUE);
         let (answers, answered) = crossbeam_channel::unbounded();
         let (queries, queued) = mpsc::unbounded_channel();
@@ -58,6 +71,7 @@ impl Connection {
             .spawn(move || decoder.run(&queue, &answered))
             .map_err(ConnectionError::Thread)?;
         let missing_queries = tokio::spawn(send_missing_queries(session.clone(), queued, answers));
+        let floods = Arc::default();
         let mut live: Vec<Box<dyn Send + Sync>> = Vec::new();
         for topic in Topic::all() {
             let delivery = match topic {
@@ -77,16 +91,19 @@ impl Connection {
                 Topic::Event => Delivery::InOrder,
                 _ => continue,
             };
-            live.push(Box::new(subscribe(&session, topic, delivery, &inputs).await?));
+            live.push(Box::new(
+                subscribe(&session, topic, delivery, &inputs, &floods).await?,
+            ));
         }
         live.push(Box::new(watch_markers(&session, &sink).await?));
         Ok(Self {
-            client: Client::new(session.clone(), sink),
+            client: Client::new(session.clone(), protection, sink)?,
             session,
             inputs,
             _live: live,
             recorded: Mutex::default(),
             missing_queries,
+            floods,
         })
     }
 
@@ -101,7 +118,16 @@ impl Connection {
         let mut subscribers = Vec::new();
         if on {
             for topic in Topic::all().filter(|topic| topic.recorded()) {
-                subscribers.push(subscribe(&self.session, topic, Delivery::InOrder, &self.inputs).await?);
+                subscribers.push(
+                    subscribe(
+                        &self.session,
+                        topic,
+                        Delivery::InOrder,
+                        &self.inputs,
+                        &self.floods,
+                    )
+                    .await?,
+                );
             }
         }
         let (done, forwarded) = oneshot::channel();
@@ -114,6 +140,14 @@ impl Connection {
         );
         drop(before);
         Ok(())
+    }
+
+    /// Cars that were muted because they flood, and that are heard again, since the last call.
+    pub(crate) fn floods(&self) -> Vec<Flood> {
+        self.floods
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .reports()
     }
 
     /// Queries every car for the ends of its streams ([`EventPayload::StreamEnds`]) and for all that it has sent by then.
@@ -180,6 +214,30 @@ async fn watch_runs(
         .map_err(|e| ConnectionError::subscribe(&key, &e))
 }
 
+/// A router that only passes messages on.
+pub struct Router(zenoh::Session);
+
+/// Opens a router. Needs a multi-thread tokio runtime.
+pub async fn open_router(role: &Role, protection: &Protection) -> Result<Router, ConnectionError> {
+    let (config, settings) = role.config(protection)?;
+    let session = zenoh::open(config).await.map_err(|e| role.open_error(&e))?;
+    drop(settings);
+    Ok(Router(session))
+}
+
+impl Router {
+    /// Ends it. Gives up after two seconds.
+    pub async fn close(self) {
+        let closing = async { self.0.close().await };
+        if tokio::time::timeout(Duration::from_secs(2), closing)
+            .await
+            .is_err()
+        {
+            tracing::warn!("the network did not confirm that the router is closed");
+        }
+    }
+}
+
 async fn watch_liveliness(
     session: &zenoh::Session,
     sink: &EventSink,
@@ -219,16 +277,44 @@ async fn subscribe(
     topic: Topic,
     delivery: Delivery,
     inputs: &Sender<DecoderInput>,
+    floods: &Arc<Mutex<FloodLimit>>,
 ) -> Result<Subscriber<()>, ConnectionError> {
     let key = topic.of_all_cars();
     let inputs = inputs.clone();
+    let floods = floods.clone();
+    let lost = AtomicU64::new(0);
     session
         .declare_subscriber(&key)
         .callback(move |sample: Sample| {
             let at = unix_now();
-            let input = DecoderInput::Sample { at, delivery, sample };
+            // A foreign key names no car to count it for.
+            let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                tracing::debug!(key = %sample.key_expr(), "ignored a sample under a foreign key");
+                return;
+            };
+            let bytes = sample.payload().len();
+            let admitted =
+                floods
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .admit(&key.car, bytes, Instant::now());
+            if !admitted {
+                return;
+            }
+            let input = DecoderInput::Sample {
+                at,
+                delivery,
+                key,
+                sample,
+            };
             if inputs.try_send(input).is_err() {
-                tracing::warn!("messages arrive faster than they can be decoded; some are lost");
+                let count = lost.fetch_add(1, Ordering::Relaxed) + 1;
+                if count.is_power_of_two() {
+                    tracing::warn!(
+                        count,
+                        "messages arrive faster than they can be decoded; some are lost"
+                    );
+                }
             }
         })
         .await

@@ -30,6 +30,7 @@ pub(super) enum DecoderInput {
     Sample {
         at: i64,
         delivery: Delivery,
+        key: Key,
         sample: Sample,
     },
     /// A car's liveliness token has appeared.
@@ -149,15 +150,15 @@ impl Decoder {
                 self.final_sync = Some(progress);
                 self.send_due_queries(now);
             }
-            DecoderInput::Sample { at, delivery, sample } => {
+            DecoderInput::Sample {
+                at,
+                delivery,
+                key,
+                sample,
+            } => {
                 if sample.kind() != SampleKind::Put {
                     return;
                 }
-                // A foreign key names no car to count it for.
-                let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-                    tracing::debug!(key = %sample.key_expr(), "ignored a sample under a foreign key");
-                    return;
-                };
                 let bytes = sample.payload().to_bytes().into();
                 let received = ReceivedMessage {
                     at,

@@ -21,6 +21,12 @@ pub enum ConnectionError {
         /// zenoh's message.
         reason: String,
     },
+    /// The keys cannot be used. The message holds no secret.
+    #[error("the keys cannot be used: {0}")]
+    Keys(String),
+    /// An endpoint does not fit the keys, or would be open to everybody.
+    #[error("{0}")]
+    Endpoint(String),
     /// The system cannot start a thread.
     #[error("cannot start the thread that decodes messages: {0}")]
     Thread(std::io::Error),

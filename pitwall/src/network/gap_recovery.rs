@@ -21,6 +21,7 @@ use protocol::{CarName, Kept, MissingRequest, Topic, Wanted};
 
 use super::reorder_buffer::ReorderBuffer;
 use crate::event::SentRange;
+use crate::fleet::Fleet;
 
 /// Period at which a car is asked for its last numbers. A lost message is noticed with the next one or with this \[ns\].
 const POLL: i64 = SECOND;
@@ -140,7 +141,22 @@ impl<T> Default for Car<T> {
 impl<T> GapRecovery<T> {
     /// Adds a car, or queries it at once when it is known.
     pub(crate) fn appeared(&mut self, car: &CarName) {
-        self.cars.entry(car.clone()).or_default().due = 0;
+        if self.has_room(car) {
+            self.cars.entry(car.clone()).or_default().due = 0;
+        }
+    }
+
+    /// True when the car is known, or can be added. A car that only announced itself makes room for another.
+    fn has_room(&mut self, car: &CarName) -> bool {
+        if self.cars.len() < Fleet::MOST_CARS || self.cars.contains_key(car) {
+            return true;
+        }
+        let silent = self.cars.iter().find(|(_, car)| car.streams.is_empty());
+        let Some(silent) = silent.map(|(name, _)| name.clone()) else {
+            return false;
+        };
+        self.cars.remove(&silent);
+        true
     }
 
     /// Switches recovery of the full-rate streams on or off. Returns what was held back for a recording that ends.
@@ -188,6 +204,9 @@ impl<T> GapRecovery<T> {
             run_id,
             number,
         } = id;
+        if !self.has_room(car) {
+            return vec![message];
+        }
         let car = self.cars.entry(car.clone()).or_default();
         let mut out = car.follow(run_id);
         if number == 0 {
@@ -266,7 +285,9 @@ impl<T> GapRecovery<T> {
         now: i64,
     ) -> (Vec<T>, Option<Vec<SentRange>>) {
         let recorded = self.recorded;
-        let car = self.cars.entry(car.clone()).or_default();
+        let Some(car) = self.cars.get_mut(car) else {
+            return (Vec::new(), None);
+        };
         let mut out = car.follow(run_id);
         let answers_final_sync = car.answers_final_sync();
         if let Some(queried) = car.queried.take() {

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `role.rs` | router or client, and the zenoh configuration of each |
 //! | `connection.rs` | opens the zenoh session and subscribes |
+//! | `flood_limit.rs` | what one car may send; pure |
 //! | `decoder.rs` | a thread that decodes messages, puts them in order and finds gaps |
 //! | `reorder_buffer.rs` | puts the messages of a stream in order and tracks which are missing; pure |
 //! | `gap_recovery.rs` | decides which missing messages to request, and when; pure |
@@ -15,6 +16,7 @@ mod client;
 mod connection;
 mod decoder;
 mod error;
+mod flood_limit;
 pub(crate) mod gap_recovery;
 mod marker;
 mod query;
@@ -24,8 +26,8 @@ mod run_gate;
 mod verdict;
 
 pub use client::{CarFiles, Client, REPLY_TIMEOUT, new_command_id};
-pub use connection::Connection;
+pub use connection::{Connection, Router, open_router};
 pub use error::ConnectionError;
 pub(crate) use role::endpoint;
-pub use role::{DEFAULT_LISTEN, LOCAL_PITWALL, Role};
+pub use role::{LOCAL_PITWALL, Role};
 pub use verdict::Verdict;

@@ -14,12 +14,14 @@ pub(super) const OPERATOR_PRIORITY: Priority = Priority::InteractiveHigh;
 /// A full queue drops a query and never blocks its sender.
 pub(super) const CONGESTION: CongestionControl = CongestionControl::Drop;
 
-/// Sends a query. Every reply within `timeout` goes to `replies`, with the query's priority.
+/// Sends a query, with a signature as its attachment. Every reply within `timeout` goes to `replies`, with the query's priority.
+#[expect(clippy::too_many_arguments, reason = "each is a part of the query")]
 pub(super) async fn query(
     session: &zenoh::Session,
     car: &CarName,
     topic: Topic,
     request: Vec<u8>,
+    signature: Option<Vec<u8>>,
     timeout: Duration,
     priority: Priority,
     replies: &mpsc::UnboundedSender<Vec<u8>>,
@@ -29,6 +31,7 @@ pub(super) async fn query(
     let sent = session
         .get(&key)
         .payload(request)
+        .attachment(signature)
         .timeout(timeout)
         .consolidation(ConsolidationMode::None)
         .congestion_control(CONGESTION)
@@ -54,7 +57,7 @@ pub(super) async fn first_reply(
     priority: Priority,
 ) -> Option<Vec<u8>> {
     let (sender, mut replies) = mpsc::unbounded_channel();
-    query(session, car, topic, request, timeout, priority, &sender).await;
+    query(session, car, topic, request, None, timeout, priority, &sender).await;
     // The query holds the other sender until it is answered or times out. Then `recv` returns None.
     drop(sender);
     replies.recv().await

@@ -4,14 +4,15 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use axum::Json;
 use axum::extract::{Query, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use serde::Deserialize;
 use serde_json::json;
 
 use super::App;
+use super::guard::Access;
 use crate::analysis::{AnalysisView, SessionLaps, TrackLine};
 
 /// Name of the laps that the page itself shows.
@@ -123,12 +124,17 @@ pub(super) async fn limits(
 }
 
 /// Sets the alarm limits on the track of a car, for all cars on it, and keeps them.
-pub(super) async fn set_limits(State(app): State<App>, Json(request): Json<LimitsRequest>) -> Response {
+pub(super) async fn set_limits(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<LimitsRequest>,
+) -> Response {
     let LimitsRequest {
         car,
         limits,
         operator,
     } = request;
+    let operator = access.name(operator);
     let Some(line) = app
         .bus
         .fleet()

@@ -2,15 +2,16 @@
 
 use std::path::PathBuf;
 
-use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use protocol::{Action, CarName, Command, CommandId, Severity};
 use serde::Deserialize;
 use serde_json::json;
 
 use super::App;
+use super::guard::Access;
 use crate::clock::unix_now;
 use crate::fleet::Car;
 use crate::network::{REPLY_TIMEOUT, new_command_id};
@@ -37,7 +38,11 @@ pub(super) struct CommandRequest {
 }
 
 /// Sends a command to a car and returns its outcome, with a text for the operator.
-pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandRequest>) -> Response {
+pub(super) async fn command(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<CommandRequest>,
+) -> Response {
     let CommandRequest {
         car,
         operator,
@@ -47,7 +52,7 @@ pub(super) async fn command(State(app): State<App>, Json(request): Json<CommandR
     } = request;
     let command = Command {
         id: id.unwrap_or_else(new_command_id),
-        operator,
+        operator: access.name(operator),
         expected_revision,
         action,
     };
@@ -76,8 +81,13 @@ pub(super) struct RecordRequest {
 }
 
 /// Starts or stops a recording, in a file named by the time.
-pub(super) async fn record(State(app): State<App>, Json(request): Json<RecordRequest>) -> Response {
+pub(super) async fn record(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<RecordRequest>,
+) -> Response {
     let RecordRequest { on, folder, operator } = request;
+    let operator = access.name(operator);
     let Some(service) = &app.service else {
         return in_a_replay();
     };
@@ -146,7 +156,11 @@ pub(super) struct MarkRequest {
 }
 
 /// Marks this moment in the log and the recording.
-pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest>) -> Response {
+pub(super) async fn mark(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<MarkRequest>,
+) -> Response {
     const LONGEST: usize = 500;
     let MarkRequest {
         car,
@@ -160,6 +174,7 @@ pub(super) async fn mark(State(app): State<App>, Json(request): Json<MarkRequest
         Some(for_s) if for_s.is_finite() && for_s > 0.0 => format!("over the last {for_s:.0} s: {text}"),
         _ => text,
     };
+    let operator = access.name(operator);
     let Some(service) = &app.service else {
         return in_a_replay();
     };
@@ -180,11 +195,16 @@ pub(super) struct AcknowledgeRequest {
 }
 
 /// Acknowledges every alarm so far, for all pages.
-pub(super) async fn acknowledge(State(app): State<App>, Json(request): Json<AcknowledgeRequest>) -> Response {
-    if request.operator.len() > Command::MAX_OPERATOR {
+pub(super) async fn acknowledge(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<AcknowledgeRequest>,
+) -> Response {
+    let operator = access.name(request.operator);
+    if operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
-    app.bus.fleet().acknowledge(app.now(), &request.operator);
+    app.bus.fleet().acknowledge(app.now(), &operator);
     StatusCode::NO_CONTENT.into_response()
 }
 
@@ -196,8 +216,13 @@ pub(super) struct DismissRequest {
 }
 
 /// Hides a car that is gone, for all pages.
-pub(super) async fn dismiss(State(app): State<App>, Json(request): Json<DismissRequest>) -> Response {
+pub(super) async fn dismiss(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    Json(request): Json<DismissRequest>,
+) -> Response {
     let DismissRequest { car, operator } = request;
+    let operator = access.name(operator);
     if operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }

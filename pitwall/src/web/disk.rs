@@ -8,7 +8,7 @@ use sysinfo::Disks;
 pub(super) const SCARCE: u64 = 1_000_000_000;
 
 /// Free bytes on the disk of `folder`; None if the system does not report them.
-pub(crate) fn free(folder: &Path) -> Option<u64> {
+pub fn free(folder: &Path) -> Option<u64> {
     let folder = folder.canonicalize().ok()?;
     let disks = Disks::new_with_refreshed_list();
     disks

@@ -22,9 +22,10 @@
 //! ```
 //!
 //! Requests from other origins are rejected. The `Content-Security-Policy` keeps the page from loading anything from
-//! elsewhere. On an address other than loopback, a token is required.
+//! elsewhere. On an address other than loopback, a token is required (`POST /login`), and with keys the page is HTTPS.
 mod analysis;
 mod api;
+mod connections;
 mod disk;
 mod guard;
 mod operators;
@@ -40,9 +41,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::extract::DefaultBodyLimit;
 use axum::http::header;
 use axum::response::IntoResponse;
 use axum::routing::{get, post};
+use keys::Bundle;
 use protocol::Severity;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -55,10 +58,14 @@ use crate::recording::RecorderOptions;
 use crate::replay::Replay;
 use analysis::Sessions;
 pub(crate) use disk::free as free_space;
+pub use disk::free as disk_free;
 use guard::Guard;
 use operators::Operators;
 use sessions::SessionList;
 use tracks::Tracks;
+
+/// Longest body of a request \[bytes\]: a whole parameter set fits.
+const LONGEST_BODY: usize = 256 * 1024;
 
 /// Where the page is served and recordings go.
 #[derive(Debug, Clone)]
@@ -85,7 +92,7 @@ impl Default for PageOptions {
 pub struct Page {
     url: String,
     stop: watch::Sender<bool>,
-    server: JoinHandle<std::io::Result<()>>,
+    server: JoinHandle<()>,
 }
 
 /// State shared by all request handlers.
@@ -130,17 +137,43 @@ impl App {
 impl Page {
     /// Binds the address and serves until [`Page::stop`].
     pub async fn serve(service: Arc<FleetService>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(service.bus().clone(), Some(service), None, options, None).await
+        Self::serve_with_keys(service, options, None).await
+    }
+
+    /// Serves over HTTPS when there are keys and the address is beyond loopback.
+    pub async fn serve_with_keys(
+        service: Arc<FleetService>,
+        options: PageOptions,
+        keys: Option<Arc<Bundle>>,
+    ) -> std::io::Result<Self> {
+        Self::serve_from(service.bus().clone(), Some(service), None, options, keys, None).await
     }
 
     /// Serves a replay.
     pub async fn serve_replay(replay: Arc<Replay>, options: PageOptions) -> std::io::Result<Self> {
-        Self::serve_from(replay.bus().clone(), None, Some(replay), options, None).await
+        Self::serve_replay_with_keys(replay, options, None).await
+    }
+
+    /// Serves a replay over HTTPS when there are keys and the address is beyond loopback.
+    pub async fn serve_replay_with_keys(
+        replay: Arc<Replay>,
+        options: PageOptions,
+        keys: Option<Arc<Bundle>>,
+    ) -> std::io::Result<Self> {
+        Self::serve_from(replay.bus().clone(), None, Some(replay), options, keys, None).await
     }
 
     /// Serves a replay to those whom the guard of another page admits. A browser keeps one token for all ports of an address.
     async fn serve_beside(replay: Arc<Replay>, options: PageOptions, guard: Guard) -> std::io::Result<Self> {
-        Self::serve_from(replay.bus().clone(), None, Some(replay), options, Some(guard)).await
+        Self::serve_from(
+            replay.bus().clone(),
+            None,
+            Some(replay),
+            options,
+            None,
+            Some(guard),
+        )
+        .await
     }
 
     async fn serve_from(
@@ -148,11 +181,16 @@ impl Page {
         service: Option<Arc<FleetService>>,
         replay: Option<Arc<Replay>>,
         options: PageOptions,
+        keys: Option<Arc<Bundle>>,
         guard: Option<Guard>,
     ) -> std::io::Result<Self> {
         let listener = TcpListener::bind(options.address).await?;
         let address = listener.local_addr()?;
-        let guard = guard.unwrap_or_else(|| Guard::new(address));
+        let guard = match guard {
+            Some(guard) => guard,
+            None => Guard::with_keys(address, keys.as_deref())?,
+        };
+        let tls = guard.tls.clone();
         let url = guard.url(address);
         let (stop, stopping) = watch::channel(false);
         let (room, disk_free) = watch::channel(None);
@@ -211,12 +249,9 @@ impl Page {
                 Arc::new(guard),
                 guard::check,
             ))
+            .layer(DefaultBodyLimit::max(LONGEST_BODY))
             .with_state(app.clone());
-        let server = tokio::spawn(async move {
-            axum::serve(listener, router)
-                .with_graceful_shutdown(async move { app.stopped().await })
-                .await
-        });
+        let server = tokio::spawn(connections::serve(listener, tls, router, app.stopping.clone()));
         Ok(Self { url, stop, server })
     }
 
@@ -228,7 +263,7 @@ impl Page {
     /// Stops serving.
     pub async fn stop(self) {
         self.stop.send_replace(true);
-        if let Ok(Err(error)) = self.server.await {
+        if let Err(error) = self.server.await {
             tracing::warn!(%error, "the page's server");
         }
     }

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use protocol::plain_text;
+
 /// The operators, one for each open page.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Operators(Arc<Mutex<Pages>>);
@@ -20,16 +22,22 @@ pub(super) struct OpenPage {
 }
 
 impl Operators {
-    /// Adds a page.
-    pub(super) fn open_page(&self) -> OpenPage {
+    /// Most open pages.
+    const MOST: usize = 100;
+
+    /// Adds a page. None when too many are open.
+    pub(super) fn open_page(&self) -> Option<OpenPage> {
         let mut pages = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if pages.names.len() >= Self::MOST {
+            return None;
+        }
         pages.next += 1;
         let number = pages.next;
         pages.names.insert(number, String::new());
-        OpenPage {
+        Some(OpenPage {
             pages: self.0.clone(),
             number,
-        }
+        })
     }
 
     /// The operator of each page, in the order in which the pages were opened. Empty for a page that has not sent a name.
@@ -43,7 +51,7 @@ impl OpenPage {
     /// Sets the operator of this page.
     pub(super) fn set_operator(&self, name: String) {
         let mut pages = self.pages.lock().unwrap_or_else(PoisonError::into_inner);
-        pages.names.insert(self.number, name);
+        pages.names.insert(self.number, plain_text(&name).into_owned());
     }
 }
 
@@ -61,11 +69,16 @@ mod tests {
     #[test]
     fn a_closed_page_is_off_the_list() {
         let operators = Operators::default();
-        let (ana, ben) = (operators.open_page(), operators.open_page());
+        let open = || operators.open_page().expect("few are open");
+        let (ana, ben) = (open(), open());
         ana.set_operator("ana".into());
         ben.set_operator("ben".into());
         assert_eq!(operators.names(), ["ana", "ben"]);
         drop(ana);
         assert_eq!(operators.names(), ["ben"]);
+        let others: Vec<_> = (0..2 * Operators::MOST)
+            .filter_map(|_| operators.open_page())
+            .collect();
+        assert_eq!(others.len(), Operators::MOST - 1);
     }
 }

@@ -3,15 +3,18 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use axum::Json;
 use axum::extract::State;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
-use axum::response::Response;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::{Extension, Json};
 use protocol::{CarName, Command};
 use serde::{Deserialize, Serialize};
 use tokio::time::MissedTickBehavior;
 
 use super::App;
+use super::guard::Access;
+use super::operators::OpenPage;
 use crate::fleet::Lap;
 use crate::fleet::LogEntry;
 use crate::fleet::{Car, CarView};
@@ -69,6 +72,10 @@ pub(super) struct Snapshot {
 struct Hello {
     /// True when the Rerun viewer is built in.
     rerun: bool,
+    /// What everybody must know about the network; None when it is protected.
+    warning: Option<String>,
+    /// The operator whose token this page has; None when the operator types a name.
+    operator: Option<String>,
     /// The last two minutes of each car.
     history: BTreeMap<CarName, Vec<HealthSample>>,
     /// The alarms that nobody has acknowledged, however old they are.
@@ -133,11 +140,13 @@ struct SentState {
     epoch: Option<u64>,
     /// The selected car, its number of laps, and when its health profile was sent.
     car: Option<(CarName, usize, Instant)>,
+    access: Access,
 }
 
 impl SentState {
-    fn new(app: &App) -> Self {
+    fn new(app: &App, access: Access) -> Self {
         Self {
+            access,
             log: app.bus.fleet().log().last().saturating_sub(HISTORY),
             ..Self::default()
         }
@@ -196,6 +205,7 @@ impl Snapshot {
         if anew {
             *sent_state = SentState {
                 number: sent_state.number,
+                access: std::mem::take(&mut sent_state.access),
                 ..Self::restarted(&fleet, epoch)
             };
         }
@@ -205,6 +215,12 @@ impl Snapshot {
         let hello = anew.then(|| Hello {
             rerun: cfg!(feature = "rerun"),
             open: fleet.log().open().cloned().collect(),
+            warning: app
+                .service
+                .as_ref()
+                .and_then(|service| service.warning())
+                .map(str::to_owned),
+            operator: sent_state.access.operator.clone(),
             history: fleet
                 .cars()
                 .map(|car| (car.name.clone(), car.history().copied().collect()))
@@ -254,23 +270,29 @@ impl Snapshot {
     }
 }
 
-pub(super) async fn once(State(app): State<App>) -> Json<Snapshot> {
-    let mut sent_state = SentState::new(&app);
+pub(super) async fn once(State(app): State<App>, Extension(access): Extension<Access>) -> Json<Snapshot> {
+    let mut sent_state = SentState::new(&app, access);
     Json(Snapshot::take(&app, None, &mut sent_state))
 }
 
-pub(super) async fn socket(State(app): State<App>, upgrade: WebSocketUpgrade) -> Response {
+pub(super) async fn socket(
+    State(app): State<App>,
+    Extension(access): Extension<Access>,
+    upgrade: WebSocketUpgrade,
+) -> Response {
+    let Some(page) = app.operators.open_page() else {
+        return (StatusCode::SERVICE_UNAVAILABLE, "too many pages are open").into_response();
+    };
     upgrade
         .max_message_size(4096)
-        .on_upgrade(move |socket| follow(app, socket))
+        .on_upgrade(move |socket| follow(app, access, page, socket))
 }
 
 /// Sends snapshots until the page is closed. Each is made when it is sent, after the one before has been drawn. A slow
 /// page therefore gets fewer snapshots, but no old ones.
-async fn follow(app: App, mut socket: WebSocket) {
+async fn follow(app: App, access: Access, page: OpenPage, mut socket: WebSocket) {
     let mut selected: Option<CarName> = None;
-    let mut sent_state = SentState::new(&app);
-    let page = app.operators.open_page();
+    let mut sent_state = SentState::new(&app, access.clone());
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / RATE));
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut drawn = 0;
@@ -294,7 +316,8 @@ async fn follow(app: App, mut socket: WebSocket) {
                     Ok(PageMessage::Drawn(message)) => drawn = message.drawn,
                     Ok(PageMessage::Settings(settings)) => {
                         selected = settings.select;
-                        if let Some(mut operator) = settings.operator {
+                        if let Some(operator) = settings.operator {
+                            let mut operator = access.name(operator);
                             operator.truncate(operator.floor_char_boundary(Command::MAX_OPERATOR));
                             page.set_operator(operator);
                         }

@@ -96,4 +96,16 @@ impl Message for MissingReply {
     const SCHEMA: Schema = Schema::MissingReply;
     /// The largest budget plus the largest message.
     const MAX_LEN: usize = 256 * 1024;
+
+    fn validate(&self) -> Result<(), Invalid> {
+        let most = crate::Header::MAX_SEQUENCE;
+        let beyond = |kept: &&Kept| kept.first > most || kept.last > most;
+        match self.streams.iter().find(beyond) {
+            None => Ok(()),
+            Some(Kept { topic, first, last }) => Err(Invalid::new(
+                "streams",
+                format!("{topic}: {first} to {last} exceeds {most}"),
+            )),
+        }
+    }
 }

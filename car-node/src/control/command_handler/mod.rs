@@ -1,19 +1,25 @@
 //! Executes commands: decodes, refuses or executes each one, publishes events and answers. It names no network: bytes come
 //! in, bytes go out.
 
+mod command_limit;
 mod parameters;
 mod pose;
+mod replay_guard;
 
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
+use command_limit::CommandLimit;
 use crossbeam_channel::{Receiver, Sender};
+use keys::Refusal;
 use maps::Pose;
 use protocol::{
     Action, Answer, Command, CommandId, EventKind, Header, Outcome, ParamsAction, RatesAction, RecordAction,
     Reply, Stamps, Topic, decode, encode,
 };
 use synpf::TrackMap;
+
+use replay_guard::ReplayGuard;
 
 use super::answer_cache::{AnswerCache, CachedAnswer, PayloadHash};
 use super::parameter_store::ParameterStore;
@@ -59,6 +65,8 @@ pub struct CommandHandlerConfig {
 pub struct CommandHandler {
     config: CommandHandlerConfig,
     answers: AnswerCache,
+    replays: ReplayGuard,
+    limit: CommandLimit,
     sequence: u64,
     update: u64,
     params_due: Instant,
@@ -71,6 +79,8 @@ impl CommandHandler {
         let handler = Self {
             answers: AnswerCache::with(config.store.persisted().answers.iter().cloned()),
             config,
+            replays: ReplayGuard::default(),
+            limit: CommandLimit::default(),
             sequence: 0,
             update: 0,
             params_due: Instant::now(),
@@ -88,8 +98,22 @@ impl CommandHandler {
     /// Executes a command and returns the encoded answer. A payload that cannot be decoded changes nothing; it is counted,
     /// and the error names the fault.
     pub fn answer(&mut self, topic: Topic, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
-        self.decode_and_execute(topic, payload)
-            .map_err(|error| self.count_unreadable(topic, error))
+        self.answer_signed(topic, payload, Ok(None))
+    }
+
+    /// The same for a command whose signature was checked: `signer` is the name of who signed it, or why it is refused. None
+    /// where commands need no signature.
+    pub fn answer_signed(
+        &mut self,
+        topic: Topic,
+        payload: Option<&[u8]>,
+        signer: Result<Option<String>, Refusal>,
+    ) -> Result<Vec<u8>, String> {
+        match self.decode_and_execute(topic, payload, signer) {
+            Err(Unanswered::Unreadable(error)) => Err(self.count_unreadable(topic, error)),
+            Err(Unanswered::TooMany(error)) => Err(error),
+            Ok(bytes) => Ok(bytes),
+        }
     }
 
     /// Counts a payload that cannot be decoded. Logs at powers of two, so that a flood does not fill the disk.
@@ -101,15 +125,36 @@ impl CommandHandler {
         error
     }
 
-    fn decode_and_execute(&mut self, topic: Topic, payload: Option<&[u8]>) -> Result<Vec<u8>, String> {
+    fn decode_and_execute(
+        &mut self,
+        topic: Topic,
+        payload: Option<&[u8]>,
+        signer: Result<Option<String>, Refusal>,
+    ) -> Result<Vec<u8>, Unanswered> {
         let payload = payload.ok_or("a command needs a payload")?;
-        let (_, command) = decode::<Command>(payload).map_err(|error| error.to_string())?;
+        let (header, mut command) = decode::<Command>(payload).map_err(|error| error.to_string())?;
         let belongs = command.action.topic();
         if belongs != topic {
-            return Err(format!("this command belongs under {belongs}, not {topic}"));
+            return Err(format!("this command belongs under {belongs}, not {topic}").into());
+        }
+        // Whoever has no valid signature shares one limit: names that are not proved are free to invent.
+        let who = match &signer {
+            Ok(Some(signer)) => signer.clone(),
+            Ok(None) => command.operator.clone(),
+            Err(_) => "unknown".to_owned(),
+        };
+        self.within_limit(&who, &command)?;
+        if let Ok(Some(signer)) = &signer {
+            command.operator = signed_name(&command.operator, signer);
         }
         let payload_hash = PayloadHash::of(&payload[Header::LEN..]);
+        let refusal = match &signer {
+            Err(refusal) => Some(refusal.to_string()),
+            Ok(Some(signer)) => self.replays.check(signer, command.id, header.published).err(),
+            Ok(None) => None,
+        };
         let answer = match self.answers.find(command.id) {
+            _ if refusal.is_some() => self.refuse(&command, refusal.unwrap_or_default()),
             Some(cached) if cached.payload_hash.is_none_or(|hash| hash == payload_hash) => {
                 cached.answer.clone()
             }
@@ -123,7 +168,37 @@ impl CommandHandler {
             published: wall_now().0,
         };
         self.sequence += 1;
-        encode(&answer, stamps).map_err(|error| error.to_string())
+        Ok(encode(&answer, stamps).map_err(|error| error.to_string())?)
+    }
+
+    /// Refuses a command without executing it, and without caching the answer.
+    fn refuse(&self, command: &Command, fault: String) -> Answer {
+        let faults = vec![fault];
+        let kind = EventKind::CommandRefused {
+            faults: faults.clone(),
+        };
+        self.event(kind, Some(command));
+        Answer {
+            id: command.id,
+            outcome: Outcome::Refused { faults },
+            set: self.config.store.reference(),
+        }
+    }
+
+    /// Refuses commands that come too fast. The first refusal of a flood is an event, with the name.
+    fn within_limit(&mut self, who: &str, command: &Command) -> Result<(), Unanswered> {
+        let Err(too_many) = self.limit.take(who, Instant::now()) else {
+            return Ok(());
+        };
+        if too_many.first {
+            let text = format!(
+                "{who} sends more than {} commands a second; the rest is ignored",
+                too_many.rate
+            );
+            self.event(EventKind::Warning { text }, Some(command));
+        }
+        let error = format!("too many commands from {who}: {} a second at most", too_many.rate);
+        Err(Unanswered::TooMany(error))
     }
 
     /// Executes a command that was not executed before, and caches the answer.
@@ -176,19 +251,11 @@ impl CommandHandler {
 
     /// Refuses a different command under an id that was used before; its sender must not get the other one's answer.
     fn refuse_used_id(&self, command: &Command) -> Answer {
-        let faults = vec![format!(
+        let fault = format!(
             "the id {} was already used for another command; send this one under a new id",
             command.id
-        )];
-        let kind = EventKind::CommandRefused {
-            faults: faults.clone(),
-        };
-        self.event(kind, Some(command));
-        Answer {
-            id: command.id,
-            outcome: Outcome::Refused { faults },
-            set: self.config.store.reference(),
-        }
+        );
+        self.refuse(command, fault)
     }
 
     fn apply_rates(&mut self, command: &Command, action: &RatesAction) -> Outcome {
@@ -287,6 +354,29 @@ impl CommandHandler {
                 .map_err(|error| vec![error.to_string()])
         })
     }
+}
+
+/// Why a command gets no answer.
+enum Unanswered {
+    /// It cannot be read.
+    Unreadable(String),
+    /// Its sender sends too many.
+    TooMany(String),
+}
+
+impl<T: Into<String>> From<T> for Unanswered {
+    fn from(error: T) -> Self {
+        Self::Unreadable(error.into())
+    }
+}
+
+/// The operator's name with the name of the keys behind it: `ana@laptop`.
+fn signed_name(operator: &str, signer: &str) -> String {
+    if operator == signer {
+        return operator.to_owned();
+    }
+    let room = Command::MAX_OPERATOR.saturating_sub(signer.len() + 1);
+    format!("{}@{signer}", &operator[..operator.floor_char_boundary(room)])
 }
 
 /// Longest fault \[bytes\]. One fault for every value of a set then fits into an event.

@@ -148,6 +148,13 @@ function take(next) {
   if (next.hello) {
     cards.remember(next.hello.history);
     $("rerun").hidden = !next.hello.rerun;
+    $("unprotected").hidden = !next.hello.warning;
+    $("unprotected").textContent = next.hello.warning || "";
+    if (next.hello.operator) {
+      operator.value = next.hello.operator;
+      operator.readOnly = true;
+      operator.title = "the owner of your token";
+    }
   }
   track.update(next, selected);
   log.add(next.log, next.acknowledged, first, next.hello?.open ?? []);

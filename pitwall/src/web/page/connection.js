@@ -22,7 +22,7 @@ export function connect(onSnapshot, onLink, onRefused) {
     onLink({ up: open && silent < SILENT, silent_s: silent / 1000, rate: times.length / 2 });
   };
   const dial = () => {
-    socket = new WebSocket(`ws://${location.host}/ws`);
+    socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
     socket.onopen = () => { retry = 200; open = true; heard = performance.now(); sendSettings(); report(); };
     socket.onmessage = (message) => {
       const snapshot = JSON.parse(message.data);
@@ -31,7 +31,7 @@ export function connect(onSnapshot, onLink, onRefused) {
       onSnapshot(snapshot);
     };
     socket.onclose = () => {
-      if (!open) fetch("/snapshot").then((r) => r.status === 403 && onRefused()).catch(() => {});
+      if (!open) fetch("/snapshot").then((r) => r.status === 401 && onRefused()).catch(() => {});
       open = false;
       report();
       setTimeout(dial, retry);

@@ -1,0 +1,200 @@
+"""compose.yaml on this machine: three green cars, and every container back after `docker kill`.
+
+    python3 .ci/compose.py PATH/TO/car-node PATH/TO/pitwall
+
+The images are made from these binaries and the libraries that they need, so that nothing is downloaded and nothing is compiled.
+Without a Docker daemon one is started as a plain process, and ended afterwards. Where neither is possible (no root, no dockerd, no
+docker-compose) it says so and ends with 0.
+"""
+
+import contextlib
+import io
+import json
+import os
+import re
+import shutil
+import ssl
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+import urllib.request
+
+FILE = os.path.join(os.path.dirname(__file__), "..", "compose", "compose.yaml")
+PROJECT = "pitwall-ci"
+USER = 65532
+# What a start or a restart may take on a busy machine [s].
+PATIENCE = 180
+FOLDERS = ["state", "recordings", "keys", "tmp", "for", *(f"for/{name}" for name in ("router", "pit", "car-1", "car-2", "car-3"))]
+SERVICES = ["router", "pitwall", "car-1", "car-2", "car-3", "keeper-1", "keeper-2"]
+
+
+def run(*words, **options):
+    return subprocess.run(words, check=True, capture_output=True, text=True, **options).stdout
+
+
+def skip(why):
+    print(f"skipped: {why}")
+    sys.exit(0)
+
+
+class Daemon:
+    """A Docker daemon: the machine's own, or one of ours."""
+
+    def __init__(self, folder):
+        self.process = None
+        if os.environ.get("DOCKER_HOST") or self.answers():
+            return
+        if os.geteuid() != 0 or not shutil.which("dockerd"):
+            skip("no Docker daemon answers, and none can be started")
+        self.socket = os.path.join(folder, "docker.sock")
+        os.environ["DOCKER_HOST"] = f"unix://{self.socket}"
+        os.environ["DOCKER_SOCKET"] = self.socket
+        log = open(os.path.join(folder, "dockerd.log"), "w")
+        self.process = subprocess.Popen(
+            ["dockerd", "--data-root", f"{folder}/data", "--exec-root", f"{folder}/exec", "--host", f"unix://{self.socket}",
+             "--pidfile", f"{folder}/dockerd.pid", "--storage-driver", "vfs"],
+            stdout=log, stderr=subprocess.STDOUT)
+        deadline = time.monotonic() + 60
+        while not self.answers():
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                self.stop()
+                print(open(log.name).read()[-600:])
+                skip("dockerd does not start here")
+            time.sleep(0.5)
+
+    @staticmethod
+    def answers():
+        return subprocess.run(["docker", "version"], capture_output=True, check=False).returncode == 0
+
+    def stop(self):
+        if self.process:
+            self.process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(60)
+
+
+def image(name, binary):
+    """An image of a program and its libraries, like the last stages of the Dockerfile."""
+    stripped = tempfile.NamedTemporaryFile()
+    if not shutil.which("strip") or subprocess.run(["strip", "-o", stripped.name, binary], check=False).returncode:
+        shutil.copy(binary, stripped.name)
+    program = os.path.basename(binary)
+    files = {f"usr/local/bin/{program}": stripped.name}
+    for library in re.findall(r"(/\S+) \(0x", run("ldd", binary)):
+        files[library.lstrip("/")] = os.path.realpath(library)
+    tar = io.BytesIO()
+    with tarfile.open(fileobj=tar, mode="w") as archive:
+        for folder in FOLDERS:
+            entry = tarfile.TarInfo(folder)
+            entry.type, entry.mode, entry.uid, entry.gid = tarfile.DIRTYPE, 0o755, USER, USER
+            archive.addfile(entry)
+        for path, source in sorted(files.items()):
+            entry = archive.gettarinfo(source, path)
+            entry.uid = entry.gid = 0
+            entry.mode = 0o755
+            with open(source, "rb") as content:
+                archive.addfile(entry, content)
+    changes = [f'ENTRYPOINT ["/usr/local/bin/{program}"]', f"USER {USER}:{USER}"]
+    words = ["docker", "import", *(word for change in changes for word in ("--change", change)), "-", name]
+    subprocess.run(words, input=tar.getvalue(), check=True, capture_output=True)
+    print(f"{name}: {len(tar.getvalue()) / 1e6:.0f} MB")
+
+
+def compose(*words):
+    tool = ["docker", "compose"] if not subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode \
+        else ["docker-compose"]
+    return run(*tool, "-f", FILE, "-p", PROJECT, *words, env={**os.environ, "COMPOSE_PROJECT_NAME": PROJECT})
+
+
+def container(service):
+    return run("docker", "ps", "-aq", "--filter", f"label=com.docker.compose.project={PROJECT}",
+               "--filter", f"label=com.docker.compose.service={service}").split()[0]
+
+
+def wait(what, condition):
+    deadline, last = time.monotonic() + PATIENCE, None
+    while time.monotonic() < deadline:
+        try:
+            last = condition()
+            if last:
+                return last
+        except Exception as error:  # noqa: BLE001: whatever is not up yet fails in its own way
+            last = error
+        time.sleep(1)
+    sys.exit(f"FAILED: not within {PATIENCE} s: {what}; last: {last}")
+
+
+def page():
+    """The snapshot of the page, by the address that it prints."""
+    logs = run("docker", "logs", container("pitwall"))
+    url = re.findall(r"https://\S+", logs)[-1]
+    base, token = url.split("/?token=")
+    authority = run("docker", "run", "--rm", "--network", "none", "-v", f"{PROJECT}_keys:/keys:ro", "synpf/pitwall", "keys",
+                    "list", "--folder", "/keys", "--json")
+    assert json.loads(authority)["hosts"]
+    # The certificate is checked against the authority of the keys.
+    pem = subprocess.run(["docker", "cp", f"{container('keys')}:/keys/authority.pem", "-"], check=True, capture_output=True).stdout
+    with tarfile.open(fileobj=io.BytesIO(pem)) as archive:
+        pem = archive.extractfile("authority.pem").read().decode()
+    context = ssl.create_default_context(cadata=pem)
+    request = urllib.request.Request(f"{base}/snapshot", headers={"Cookie": f"pitwall={token}"})
+    with urllib.request.urlopen(request, timeout=5, context=context) as reply:
+        return json.load(reply)
+
+
+def green():
+    cars = page()["cars"]
+    return len(cars) == 3 and all(car["state"] == "LOCALIZED" and not car["blind"] for car in cars)
+
+
+def running(service):
+    state = json.loads(run("docker", "inspect", container(service)))[0]["State"]
+    health = state.get("Health", {}).get("Status", "healthy")
+    return state["Running"] and health == "healthy"
+
+
+def check(folder):
+    car_node, pitwall = sys.argv[1:3]
+    daemon = Daemon(folder)
+    try:
+        if subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode and \
+                not shutil.which("docker-compose"):
+            skip("no docker-compose")
+        image("synpf/car-node", car_node)
+        image("synpf/pitwall", pitwall)
+        began = time.monotonic()
+        compose("up", "-d", "--no-build")
+        wait("three green cars in the page", green)
+        print(f"three green cars after {time.monotonic() - began:.0f} s")
+        for service in SERVICES:
+            wait(f"{service} is healthy", lambda service=service: running(service))
+        cars = run("docker", "exec", container("pitwall"), "/usr/local/bin/pitwall", "cars", "--json",
+                   "--keys", "/keys/pit.keys", "--connect", "tls/router:7447")
+        states = [car["state"] for car in json.loads(cars)]
+        assert states == ["LOCALIZED"] * 3, states
+        for service in SERVICES:
+            before = json.loads(run("docker", "inspect", container(service)))[0]["State"]["StartedAt"]
+            run("docker", "kill", container(service))
+            began = time.monotonic()
+            wait(f"{service} is back", lambda service=service, before=before: running(service) and json.loads(
+                run("docker", "inspect", container(service)))[0]["State"]["StartedAt"] != before)
+            wait(f"three green cars after {service} was killed", green)
+            print(f"{service}: killed, all green again after {time.monotonic() - began:.0f} s")
+        for secret in ("PRIVATE KEY",):
+            for service in SERVICES:
+                assert secret not in run("docker", "logs", container(service)), service
+    finally:
+        with contextlib.suppress(Exception):
+            compose("down", "-v", "-t", "3")
+        daemon.stop()
+
+
+def main():
+    with tempfile.TemporaryDirectory() as folder:
+        check(folder)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,405 @@
+//! Who gets in, and what they may do: keys, passphrase, and attacks on both.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use keys::{Authority, Protection, Role, Side, Signer};
+use pitwall::{FleetService, unix_now};
+use protocol::{Action, Answer, CarName, Command, CommandId, Key, Outcome, Stamps, Topic, decode, encode};
+use system_tests::{
+    Behaviour, FakeCar, client, free_endpoint, in_force, named, router, select, send_command,
+    start_real_protected, wait_until,
+};
+use zenoh::Session;
+
+/// A team with a laptop, three cars and a viewer.
+fn team() -> Authority {
+    let mut authority = Authority::create(30).expect("an authority");
+    for (role, name) in [
+        (Role::Pit, "laptop"),
+        (Role::Car, "car-1"),
+        (Role::Car, "car-2"),
+        (Role::Car, "car-3"),
+        (Role::Viewer, "fan"),
+    ] {
+        authority.issue(role, named(name), &[]).expect("issued");
+    }
+    authority
+}
+
+fn keys_of(authority: &Authority, role: Role, name: &str) -> Protection {
+    Protection::Keys(Arc::new(authority.bundle(role, &named(name)).expect("in force")))
+}
+
+/// A free endpoint for links with keys.
+fn free_tls_endpoint() -> String {
+    free_endpoint().replace("tcp/", "tls/")
+}
+
+async fn pit_wall(authority: &Authority, endpoint: &str) -> Arc<FleetService> {
+    let keys = keys_of(authority, Role::Pit, "laptop");
+    FleetService::open_protected(&router(endpoint), &keys)
+        .await
+        .expect("a pit wall")
+}
+
+/// A session that follows no rules but those of the other side. None when it is not let in.
+async fn session(endpoint: &str, protection: &Protection) -> Option<Session> {
+    let mut config = zenoh::Config::default();
+    let settings = protection.settings(&Side::Client).expect("settings");
+    let plain = [
+        ("mode", r#""client""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("connect/timeout_ms", "1500".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ];
+    let rules = settings
+        .entries
+        .iter()
+        .filter(|(key, _)| *key != "access_control");
+    for (key, value) in plain.iter().chain(rules) {
+        config.insert_json5(key, value).expect("a good setting");
+    }
+    zenoh::open(config).await.ok()
+}
+
+fn command(operator: &str, action: Action) -> Command {
+    Command {
+        id: pitwall::new_command_id(),
+        operator: operator.into(),
+        expected_revision: None,
+        action,
+    }
+}
+
+fn bytes(command: &Command) -> Vec<u8> {
+    let stamps = Stamps {
+        published: unix_now(),
+        ..Stamps::default()
+    };
+    encode(command, stamps).expect("a good message")
+}
+
+/// Sends a command past our own client. Returns the answer, if any.
+async fn send_raw(
+    session: &Session,
+    car: &CarName,
+    topic: Topic,
+    command: Vec<u8>,
+    signature: Option<Vec<u8>>,
+) -> Option<Answer> {
+    let replies = session
+        .get(Key::new(car.clone(), topic).to_string())
+        .payload(command)
+        .attachment(signature)
+        .timeout(Duration::from_secs(5))
+        .await
+        .expect("sent");
+    let reply = replies.recv_async().await.ok()?;
+    let sample = reply.into_result().ok()?;
+    let (_, answer) = decode::<Answer>(&sample.payload().to_bytes()).expect("an answer");
+    Some(answer)
+}
+
+fn faults(answer: Option<Answer>) -> String {
+    match answer.expect("an answer").outcome {
+        Outcome::Refused { faults } => faults.join("; "),
+        outcome => panic!("not refused: {outcome:?}"),
+    }
+}
+
+async fn seen(wall: &FleetService, car: &CarName) {
+    wait_until("the car is seen", || {
+        wall.fleet()
+            .car(car)
+            .is_some_and(|car| car.alive && car.pose.is_some())
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn keys_decide_who_commands() {
+    let authority = team();
+    let endpoint = free_tls_endpoint();
+    let wall = pit_wall(&authority, &endpoint).await;
+    let car = named("car-1");
+    let node = start_real_protected(
+        &car,
+        0.0,
+        &endpoint,
+        None,
+        keys_of(&authority, Role::Car, "car-1"),
+    );
+    seen(&wall, &car).await;
+    let run_id = wall
+        .fleet()
+        .car(&car)
+        .and_then(|car| car.info.clone())
+        .map(|info| info.started);
+
+    // The pit wall commands; the car logs who, and whose keys.
+    let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+    wait_until("the car says who it was", || {
+        let fleet = wall.fleet();
+        fleet
+            .log()
+            .since(0)
+            .any(|entry| entry.who.as_deref() == Some("ana@laptop"))
+    })
+    .await;
+
+    // So does a second program with the same keys.
+    let laptop = keys_of(&authority, Role::Pit, "laptop");
+    let second = FleetService::open_protected(&client(&endpoint), &laptop)
+        .await
+        .expect("joined");
+    seen(&second, &car).await;
+    let verdict = send_command(&second, &car, "ben", None, select("hq")).await;
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+
+    // A viewer sees everything and commands nothing, with our program or without.
+    let fan = keys_of(&authority, Role::Viewer, "fan");
+    let viewer = FleetService::open_protected(&client(&endpoint), &fan)
+        .await
+        .expect("joined");
+    seen(&viewer, &car).await;
+    let verdict = send_command(&viewer, &car, "fan", None, select("lq")).await;
+    assert_eq!(verdict.exit_code(), 3, "{verdict:?}");
+    let run_id = match run_id {
+        Some(run_id) => run_id,
+        None => wall.client().fetch_info(&car).await.expect("an answer").started,
+    };
+    let forged = bytes(&command("fan", select("lq")));
+    let key = Key::new(car.clone(), Topic::CmdParams).to_string();
+    let raw = session(&endpoint, &fan).await.expect("let in");
+    let bundle = authority.bundle(Role::Viewer, &named("fan")).expect("in force");
+    let signature = Signer::new(&bundle)
+        .expect("a key")
+        .sign(&key, run_id, &forged)
+        .expect("signed");
+    assert_eq!(
+        send_raw(
+            &raw,
+            &car,
+            Topic::CmdParams,
+            forged.clone(),
+            Some(signature.clone())
+        )
+        .await,
+        None
+    );
+
+    // Past the router's rules the car refuses by itself: no signature, a viewer's, that of another command.
+    let raw = session(&endpoint, &laptop).await.expect("let in");
+    let unsigned = send_raw(&raw, &car, Topic::CmdParams, forged.clone(), None).await;
+    assert!(faults(unsigned).contains("not signed"));
+    let viewers = send_raw(&raw, &car, Topic::CmdParams, forged.clone(), Some(signature)).await;
+    assert!(faults(viewers).contains("viewer fan may not command"));
+    let bundle = authority.bundle(Role::Pit, &named("laptop")).expect("in force");
+    let signer = Signer::new(&bundle).expect("a key");
+    let other = signer.sign(&key, run_id, b"another command").expect("signed");
+    let wrong = send_raw(&raw, &car, Topic::CmdParams, forged.clone(), Some(other)).await;
+    assert!(faults(wrong).contains("does not belong"));
+    wait_until("ben's set stays in force", || {
+        in_force(&wall, &car).is_some_and(|set| set.0 == "hq")
+    })
+    .await;
+
+    // A recorded command gets the answer that it got, and has no further effect.
+    let good = bytes(&command("ana", select("lq")));
+    let signature = signer.sign(&key, run_id, &good).expect("signed");
+    let first = send_raw(
+        &raw,
+        &car,
+        Topic::CmdParams,
+        good.clone(),
+        Some(signature.clone()),
+    )
+    .await;
+    let again = send_raw(
+        &raw,
+        &car,
+        Topic::CmdParams,
+        good.clone(),
+        Some(signature.clone()),
+    )
+    .await;
+    assert_eq!(
+        first.as_ref().map(|answer| &answer.outcome),
+        again.as_ref().map(|answer| &answer.outcome)
+    );
+    assert!(first.is_some());
+
+    // After the car's restart it is void.
+    node.shutdown("restart");
+    let node = start_real_protected(
+        &car,
+        0.0,
+        &endpoint,
+        None,
+        keys_of(&authority, Role::Car, "car-1"),
+    );
+    wait_until("the car is back", || {
+        let fleet = wall.fleet();
+        fleet.car(&car).is_some_and(|car| car.alive)
+    })
+    .await;
+    let mut replayed = None;
+    while replayed.is_none() {
+        replayed = send_raw(
+            &raw,
+            &car,
+            Topic::CmdParams,
+            good.clone(),
+            Some(signature.clone()),
+        )
+        .await;
+    }
+    assert!(faults(replayed).contains("does not belong"));
+    node.shutdown("the test is over");
+    for service in [second, viewer, wall] {
+        service.close().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn strangers_stay_outside_and_cars_write_under_their_own_name() {
+    let mut authority = team();
+    let endpoint = free_tls_endpoint();
+    let stolen = keys_of(&authority, Role::Car, "car-3");
+    authority.revoke(Role::Car, &named("car-3")).expect("revoked");
+    let wall = pit_wall(&authority, &endpoint).await;
+    let good = keys_of(&authority, Role::Car, "car-1");
+    let car = FakeCar::start_protected("car-1", &endpoint, Behaviour::default(), &good).await;
+    seen(&wall, car.name()).await;
+
+    // No certificate, an expired one, one of another authority.
+    let plain = endpoint.replace("tls/", "tcp/");
+    assert!(session(&plain, &Protection::None).await.is_none());
+    assert!(session(&endpoint, &Protection::None).await.is_none());
+    let mut late = authority.clone();
+    late.issue_until(
+        Role::Car,
+        named("late"),
+        Vec::new(),
+        time::OffsetDateTime::UNIX_EPOCH,
+    )
+    .expect("issued");
+    assert!(
+        session(&endpoint, &keys_of(&late, Role::Car, "late"))
+            .await
+            .is_none()
+    );
+    assert!(
+        session(&endpoint, &keys_of(&team(), Role::Car, "car-1"))
+            .await
+            .is_none()
+    );
+
+    // Another car's keys, and revoked ones, connect and are not heard.
+    for (protection, name) in [
+        (keys_of(&authority, Role::Car, "car-2"), "car-3"),
+        (stolen, "car-3"),
+    ] {
+        let forger = FakeCar::start_protected(name, &endpoint, Behaviour::default(), &protection).await;
+        let before = car.published()[&Topic::Pose];
+        wait_until("the good car goes on", || {
+            car.published()[&Topic::Pose] > before + 40
+        })
+        .await;
+        assert!(wall.fleet().car(forger.name()).is_none(), "{name}");
+        forger.leave().await;
+    }
+    // With its own name, car-2 is heard, and not under another.
+    let own = keys_of(&authority, Role::Car, "car-2");
+    let raw = session(&endpoint, &own).await.expect("let in");
+    let pose = Key::new(named("car-1"), Topic::Event).to_string();
+    raw.put(&pose, vec![0xff; 60]).await.expect("sent");
+    let second = FakeCar::start_protected("car-2", &endpoint, Behaviour::default(), &own).await;
+    seen(&wall, second.name()).await;
+    let forged = wall
+        .fleet()
+        .log()
+        .since(0)
+        .any(|entry| entry.kind == "unreadable");
+    assert!(!forged);
+    wall.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_passphrase_lets_in_whoever_knows_it() {
+    let with = |words| Protection::Passphrase(Arc::new(keys::Passphrase::new(words).expect("long enough")));
+    let (right, wrong) = (
+        with("four words for a club day"),
+        with("four words for another day"),
+    );
+    let endpoint = free_endpoint();
+    let wall = FleetService::open_protected(&router(&endpoint), &right)
+        .await
+        .expect("a pit wall");
+    assert!(wall.warning().is_none());
+    let car = named("car-1");
+    let node = start_real_protected(&car, 0.0, &endpoint, None, right.clone());
+    seen(&wall, &car).await;
+    let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+    assert!(session(&endpoint, &wrong).await.is_none());
+    assert!(session(&endpoint, &Protection::None).await.is_none());
+    // Whoever gets past the pit wall still needs the passphrase.
+    let inside = session(&endpoint, &right).await.expect("let in");
+    let forged = bytes(&command("mallory", select("hq")));
+    let answer = send_raw(&inside, &car, Topic::CmdParams, forged, None).await;
+    assert!(faults(answer).contains("not signed"));
+    node.shutdown("the test is over");
+    wall.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flood_of_commands_is_named_and_others_are_served() {
+    let authority = team();
+    let endpoint = free_tls_endpoint();
+    let wall = pit_wall(&authority, &endpoint).await;
+    let car = named("car-1");
+    let node = start_real_protected(
+        &car,
+        0.0,
+        &endpoint,
+        None,
+        keys_of(&authority, Role::Car, "car-1"),
+    );
+    seen(&wall, &car).await;
+    let raw = session(&endpoint, &keys_of(&authority, Role::Pit, "laptop"))
+        .await
+        .expect("let in");
+    let key = Key::new(car.clone(), Topic::CmdAuto).to_string();
+    for number in 0..1000_u32 {
+        let mut flood = command("mallory", Action::Auto(number % 2 == 0));
+        flood.id = CommandId(u128::from(number) + 1);
+        raw.get(&key)
+            .payload(bytes(&flood))
+            .callback(|_| {})
+            .await
+            .expect("sent");
+    }
+    let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
+    assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
+    wait_until("the flood is named", || {
+        let fleet = wall.fleet();
+        fleet.log().since(0).any(|entry| {
+            entry
+                .text
+                .contains("unknown sends more than 20 commands a second")
+        })
+    })
+    .await;
+    let refused = wall
+        .fleet()
+        .log()
+        .since(0)
+        .filter(|entry| entry.text.contains("not signed"))
+        .count();
+    assert!(refused < 100, "{refused} events");
+    node.shutdown("the test is over");
+    wall.close().await;
+}

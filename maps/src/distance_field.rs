@@ -424,10 +424,10 @@ mod tests {
     proptest! {
         #[test]
         fn traced_and_cast_ranges_agree(x in 2.0..18.0, y in 2.0..10.0, heading in -3.1f64..3.1) {
-            let cells = (0..20 * 12)
-                .map(|i| if matches!((i % 20, i / 20), (0 | 19, _) | (_, 0 | 11)) { Cell::Occupied } else { Cell::Free })
-                .collect();
-            let grid = OccupancyGrid::new(20, 12, 1.0, Pose::IDENTITY, cells);
+            let grid = OccupancyGrid::from_fn(20, 12, 1.0, Pose::IDENTITY, |column, row| match (column, row) {
+                (0 | 19, _) | (_, 0 | 11) => Cell::Occupied,
+                _ => Cell::Free,
+            });
             let field = DistanceField::new(&grid);
             let exact = grid.cast(Pose::new(x, y, heading), 50.0);
             let traced = field.trace([x as f32, y as f32], [heading.cos() as f32, heading.sin() as f32], 50.0);

@@ -54,6 +54,20 @@ impl OccupancyGrid {
         }
     }
 
+    /// A grid whose cell at column and row is `cell(column, row)`.
+    pub fn from_fn(
+        width: usize,
+        height: usize,
+        resolution: f64,
+        origin: Pose,
+        cell: impl Fn(usize, usize) -> Cell,
+    ) -> Self {
+        let cells = (0..width * height)
+            .map(|index| cell(index % width, index / width))
+            .collect();
+        Self::new(width, height, resolution, origin, cells)
+    }
+
     /// True if a laser can see a wall: an occupied cell, or, on a map that marks no walls, the border of free and unknown
     /// space.
     pub fn has_wall(&self) -> bool {

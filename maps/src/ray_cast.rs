@@ -48,13 +48,12 @@ mod tests {
 
     /// A room of 10 x 6 m with cells of 0.1 m, turned by 0.3 rad, walls one cell thick.
     fn room() -> OccupancyGrid {
-        let cells = (0..60 * 100)
-            .map(|i| match (i % 100, i / 100) {
+        OccupancyGrid::from_fn(100, 60, 0.1, Pose::new(3.0, -2.0, 0.3), |column, row| {
+            match (column, row) {
                 (0 | 99, _) | (_, 0 | 59) => Cell::Occupied,
                 _ => Cell::Free,
-            })
-            .collect();
-        OccupancyGrid::new(100, 60, 0.1, Pose::new(3.0, -2.0, 0.3), cells)
+            }
+        })
     }
 
     #[test]

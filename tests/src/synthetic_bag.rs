@@ -30,15 +30,14 @@ pub fn room() -> OccupancyGrid {
     let wall = |column: usize, row: usize| {
         column == 0 || row == 0 || column == width - 1 || row == height - 1 || (column > 110 && row > 60)
     };
-    let cell = |at: usize| {
-        if wall(at % width, at / width) {
+    let cell = |column, row| {
+        if wall(column, row) {
             Cell::Occupied
         } else {
             Cell::Free
         }
     };
-    let cells = (0..width * height).map(cell).collect();
-    OccupancyGrid::new(width, height, RESOLUTION, Pose::IDENTITY, cells)
+    OccupancyGrid::from_fn(width, height, RESOLUTION, Pose::IDENTITY, cell)
 }
 
 /// The car's pose at a time after the start \[s\]. It drives on a circle in the left half of the room.

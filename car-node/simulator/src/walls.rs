@@ -265,18 +265,12 @@ mod tests {
     #[test]
     fn walls_of_a_map_are_its_contours() {
         // A free room of 2 m x 1 m in a map of 5 cm cells.
-        let (width, height) = (60, 40);
-        let cells = (0..width * height)
-            .map(|i| (i % width, i / width))
-            .map(|(c, r)| {
-                if (10..50).contains(&c) && (10..30).contains(&r) {
-                    Cell::Free
-                } else {
-                    Cell::Occupied
-                }
-            })
-            .collect();
-        let grid = OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells);
+        let grid = OccupancyGrid::from_fn(60, 40, 0.05, Pose::IDENTITY, |column, row| {
+            match (10..50).contains(&column) && (10..30).contains(&row) {
+                true => Cell::Free,
+                false => Cell::Occupied,
+            }
+        });
         let walls = Walls::from_grid(&grid);
         for (direction, expected) in [
             ([1.0, 0.0], 1.0),

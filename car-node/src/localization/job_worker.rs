@@ -1,4 +1,4 @@
-//! Runs what takes a localizer longer than an update, such as a look at the whole map, beside the filter's thread.
+//! Runs the jobs of a localizer that take longer than an update, such as a search of the whole map, on another thread.
 
 use std::io;
 use std::thread::{self, JoinHandle};
@@ -26,7 +26,7 @@ impl JobWorker {
         let (done, outcomes) = bounded(2 * QUEUED);
         let run = move || {
             for (generation, job) in waiting {
-                // The filter is gone: nobody needs the outcome.
+                // The filter has ended: nobody needs the outcome.
                 if done.send((generation, job())).is_err() {
                     return;
                 }
@@ -54,7 +54,7 @@ impl JobWorker {
         let (Some(jobs), Some(job)) = (&self.jobs, localizer.take_job()) else {
             return;
         };
-        // A queue that is full, or whose thread is gone, is no reason to leave the localizer without an answer.
+        // If the queue is full or its thread has ended, the job runs here, because the localizer needs an outcome.
         if let Err(TrySendError::Full((_, job)) | TrySendError::Disconnected((_, job))) =
             jobs.try_send((self.generation, job))
         {
@@ -62,7 +62,7 @@ impl JobWorker {
         }
     }
 
-    /// The localizer has been replaced: outcomes for the one before are of no use.
+    /// The localizer has been replaced: outcomes for the previous one are discarded.
     pub(super) fn discard(&mut self) {
         self.generation += 1;
     }
@@ -71,7 +71,7 @@ impl JobWorker {
 impl Drop for JobWorker {
     fn drop(&mut self) {
         self.jobs = None;
-        // The thread may wait to hand over an outcome.
+        // The thread may be waiting to send an outcome.
         self.outcomes = crossbeam_channel::never();
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
@@ -82,7 +82,7 @@ impl Drop for JobWorker {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::sync::Arc;
     use std::time::{Duration, Instant};
 
@@ -92,19 +92,14 @@ mod tests {
     use super::*;
 
     /// A room of 5 m x 4 m without symmetry, and a scan in it.
-    fn room() -> Arc<TrackMap> {
+    pub(in super::super) fn room() -> TrackMap {
         let wall = |x: usize, y: usize| {
             x == 0 || y == 0 || x == 99 || y == 79 || ((60..64).contains(&x) && y < 30) || (x < 20 && y == 50)
         };
-        let cells = (0..100 * 80).map(|i| {
-            if wall(i % 100, i / 100) {
-                Cell::Occupied
-            } else {
-                Cell::Free
-            }
+        let grid = OccupancyGrid::from_fn(100, 80, 0.05, Pose::IDENTITY, |x, y| {
+            if wall(x, y) { Cell::Occupied } else { Cell::Free }
         });
-        let grid = OccupancyGrid::new(100, 80, 0.05, Pose::IDENTITY, cells.collect());
-        Arc::new(TrackMap::new(grid).expect("free space"))
+        TrackMap::new(grid).expect("free space")
     }
 
     fn scan(map: &TrackMap, pose: Pose, stamp: Stamp) -> Scan {
@@ -127,7 +122,7 @@ mod tests {
 
     #[test]
     fn a_search_goes_on_with_what_the_worker_has_found() {
-        let map = room();
+        let map = Arc::new(room());
         let mut localizer =
             SynPf::new(Arc::clone(&map), Pose::IDENTITY, Parameters::default(), 1).expect("a sound set");
         let worker = JobWorker::start().expect("a thread");

@@ -62,20 +62,15 @@ impl Drop for TableWorker {
 mod tests {
     use std::time::{Duration, Instant};
 
-    use maps::{Cell, OccupancyGrid, Pose};
+    use maps::Pose;
     use synpf::{Parameters, SynPf, TablePolicy};
 
     use super::*;
+    use crate::localization::job_worker::tests::room;
 
     #[test]
     fn a_table_that_a_localizer_waits_for_is_built_on_the_workers_thread() {
-        let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
-        let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
-        let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());
-        let map = TrackMap::new(grid)
-            .expect("free space")
-            .with_table_policy(TablePolicy::Defer);
-        let map = Arc::new(map);
+        let map = Arc::new(room().with_table_policy(TablePolicy::Defer));
         let worker = TableWorker::start(Arc::clone(&map)).expect("a thread");
         let mut localizer =
             SynPf::new(Arc::clone(&map), Pose::IDENTITY, Parameters::default(), 1).expect("a sound set");

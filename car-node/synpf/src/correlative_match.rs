@@ -158,23 +158,20 @@ mod tests {
 
     /// An L of 12 x 12 m in cells of 5 cm, its legs 4 m wide, and a niche in one of them so that nothing is symmetric.
     fn map() -> TrackMap {
-        let size = 240;
         let free = |column: usize, row: usize| {
             let inside = |v: usize, from: usize, to: usize| (from..to).contains(&v);
             inside(column, 2, 238) && inside(row, 2, 82)
                 || inside(column, 2, 82) && inside(row, 2, 238)
                 || inside(column, 150, 190) && inside(row, 82, 100)
         };
-        let cells = (0..size * size)
-            .map(|i| {
-                if free(i % size, i / size) {
-                    Cell::Free
-                } else {
-                    Cell::Occupied
-                }
-            })
-            .collect();
-        TrackMap::new(OccupancyGrid::new(size, size, 0.05, Pose::IDENTITY, cells)).expect("free space")
+        let cell = |column: usize, row: usize| {
+            if free(column, row) {
+                Cell::Free
+            } else {
+                Cell::Occupied
+            }
+        };
+        TrackMap::new(OccupancyGrid::from_fn(240, 240, 0.05, Pose::IDENTITY, cell)).expect("free space")
     }
 
     /// What a laser sees over 270 degrees, in its own frame.

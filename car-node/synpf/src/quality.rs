@@ -115,7 +115,6 @@ pub(crate) mod tests {
 
     /// A room of 10 x 6 m in cells of 5 cm, with a door 2 m wide in its right wall. Nothing was mapped around it.
     pub(crate) fn room() -> TrackMap {
-        let (width, height) = (240, 160);
         let cell = |column: usize, row: usize| {
             let inside = (20..220).contains(&column) && (20..140).contains(&row);
             let door = column >= 200 && (60..100).contains(&row);
@@ -125,8 +124,7 @@ pub(crate) mod tests {
                 _ => Cell::Free,
             }
         };
-        let cells = (0..width * height).map(|i| cell(i % width, i / width)).collect();
-        TrackMap::new(OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells)).expect("free space")
+        TrackMap::new(OccupancyGrid::from_fn(240, 160, 0.05, Pose::IDENTITY, cell)).expect("free space")
     }
 
     /// What a laser sees all around; there is a wall 2.5 m behind the door.

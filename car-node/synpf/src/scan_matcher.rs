@@ -273,15 +273,13 @@ mod tests {
 
     /// A room of 10 x 6 m in cells of 5 cm; `open` leaves the short walls 20 m away, out of the laser's sight.
     fn room(open: bool) -> DistanceField {
-        let (width, height) = (if open { 1000 } else { 200 }, 120);
-        let cells = (0..width * height)
-            .map(|i| match (i % width, i / width) {
-                (_, 0 | 119) => Cell::Occupied,
-                (column, _) if column == 0 || column == width - 1 => Cell::Occupied,
-                _ => Cell::Free,
-            })
-            .collect();
-        DistanceField::new(&OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells))
+        let width = if open { 1000 } else { 200 };
+        let cell = |column: usize, row: usize| match (column, row) {
+            (_, 0 | 119) => Cell::Occupied,
+            (column, _) if column == 0 || column == width - 1 => Cell::Occupied,
+            _ => Cell::Free,
+        };
+        DistanceField::new(&OccupancyGrid::from_fn(width, 120, 0.05, Pose::IDENTITY, cell))
     }
 
     /// What a laser of 20 m sees all around, in its own frame.

@@ -270,9 +270,12 @@ pub(crate) mod tests {
 
     /// A room of 5 x 5 m.
     pub(crate) fn room() -> TrackMap {
-        let wall = |i: usize| [i % 100, i / 100].into_iter().any(|v| v == 0 || v == 99);
-        let cells = (0..100 * 100).map(|i| if wall(i) { Cell::Occupied } else { Cell::Free });
-        let grid = OccupancyGrid::new(100, 100, 0.05, Pose::IDENTITY, cells.collect());
+        let grid = OccupancyGrid::from_fn(100, 100, 0.05, Pose::IDENTITY, |column, row| {
+            match (column, row) {
+                (0 | 99, _) | (_, 0 | 99) => Cell::Occupied,
+                _ => Cell::Free,
+            }
+        });
         TrackMap::new(grid).expect("free space")
     }
 

@@ -175,14 +175,11 @@ fn topic(pick: u8) -> Topic {
 fn map() -> &'static Arc<TrackMap> {
     static MAP: OnceLock<Arc<TrackMap>> = OnceLock::new();
     MAP.get_or_init(|| {
-        let (width, height) = (60, 40);
-        let cells = (0..width * height)
-            .map(|i| match (i % width, i / width) {
-                (0 | 59, _) | (_, 0 | 39) | (20..=40, 15..=25) => Cell::Occupied,
-                _ => Cell::Free,
-            })
-            .collect();
-        let grid = OccupancyGrid::new(width, height, 0.1, Pose::new(-1.0, 2.0, 0.3), cells);
+        let origin = Pose::new(-1.0, 2.0, 0.3);
+        let grid = OccupancyGrid::from_fn(60, 40, 0.1, origin, |column, row| match (column, row) {
+            (0 | 59, _) | (_, 0 | 39) | (20..=40, 15..=25) => Cell::Occupied,
+            _ => Cell::Free,
+        });
         Arc::new(TrackMap::new(grid).expect("has free cells"))
     })
 }

@@ -171,10 +171,8 @@ mod tests {
 
     /// A long wall along x, its face at y = 2 m.
     fn wall() -> DistanceField {
-        let cells = (0..400 * 60)
-            .map(|i| if i / 400 >= 40 { Cell::Occupied } else { Cell::Free })
-            .collect();
-        DistanceField::new(&OccupancyGrid::new(400, 60, 0.05, Pose::IDENTITY, cells))
+        let cell = |_, row| if row >= 40 { Cell::Occupied } else { Cell::Free };
+        DistanceField::new(&OccupancyGrid::from_fn(400, 60, 0.05, Pose::IDENTITY, cell))
     }
 
     /// Hits on it from (10, 1), standing nearer by `offset` and scattering by `sigma`, with an opponent in every fourth beam.

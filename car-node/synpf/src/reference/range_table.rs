@@ -242,7 +242,6 @@ mod tests {
 
     /// A room of 40 x 30 cells with walls one cell thick; beyond a gap in the right wall is the unknown.
     fn room() -> OccupancyGrid {
-        let (width, height) = (60, 40);
         let cell = |x: usize, y: usize| {
             let inside = (5..45).contains(&x) && (5..35).contains(&y);
             let gap = x >= 44 && (18..22).contains(&y);
@@ -253,8 +252,7 @@ mod tests {
                 (false, _) => Cell::Unknown,
             }
         };
-        let cells = (0..width * height).map(|i| cell(i % width, i / width)).collect();
-        OccupancyGrid::new(width, height, 0.05, Pose::IDENTITY, cells)
+        OccupancyGrid::from_fn(60, 40, 0.05, Pose::IDENTITY, cell)
     }
 
     fn method(long: bool) -> Method {

@@ -51,15 +51,12 @@ enum Event {
 fn map() -> &'static Arc<TrackMap> {
     static MAP: OnceLock<Arc<TrackMap>> = OnceLock::new();
     MAP.get_or_init(|| {
-        let (width, height) = (60, 40);
-        let cells = (0..width * height)
-            .map(|i| match (i % width, i / width) {
-                (0, _) | (_, 0 | 39) | (20..=40, 15..=25) => Cell::Occupied,
-                (59, row) if row % 7 == 0 => Cell::Unknown,
-                _ => Cell::Free,
-            })
-            .collect();
-        let grid = OccupancyGrid::new(width, height, 0.1, Pose::new(-1.0, 2.0, 0.3), cells);
+        let origin = Pose::new(-1.0, 2.0, 0.3);
+        let grid = OccupancyGrid::from_fn(60, 40, 0.1, origin, |column, row| match (column, row) {
+            (0, _) | (_, 0 | 39) | (20..=40, 15..=25) => Cell::Occupied,
+            (59, row) if row % 7 == 0 => Cell::Unknown,
+            _ => Cell::Free,
+        });
         Arc::new(TrackMap::new(grid).expect("has free cells"))
     })
 }

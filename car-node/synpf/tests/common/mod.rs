@@ -32,21 +32,18 @@ pub(crate) fn ring() -> Arc<TrackMap> {
 pub(crate) fn new_ring() -> Arc<TrackMap> {
     let (size, resolution) = (400usize, 0.05);
     let middle = size as f64 * resolution / 2.0;
-    let cells = (0..size * size)
-        .map(|i| {
-            let (x, y) = ((i % size) as f64 + 0.5, (i / size) as f64 + 0.5);
-            let (x, y) = (x * resolution - middle, y * resolution - middle);
-            let off = x.hypot(y) - radius(y.atan2(x));
-            if off.abs() < 1.2 {
-                Cell::Free
-            } else {
-                Cell::Occupied
-            }
-        })
-        .collect();
+    let cell = |column: usize, row: usize| {
+        let [x, y] = [column, row].map(|v| (v as f64 + 0.5) * resolution - middle);
+        let off = x.hypot(y) - radius(y.atan2(x));
+        if off.abs() < 1.2 {
+            Cell::Free
+        } else {
+            Cell::Occupied
+        }
+    };
     let origin = Pose::new(0.0, 0.0, 0.5) * Pose::new(-middle, -middle, 0.0);
     Arc::new(
-        TrackMap::new(OccupancyGrid::new(size, size, resolution, origin, cells)).expect("a ring is free"),
+        TrackMap::new(OccupancyGrid::from_fn(size, size, resolution, origin, cell)).expect("a ring is free"),
     )
 }
 

@@ -176,10 +176,10 @@ fn plain() -> Parameters {
     set.particles.min_particles = reference.max_particles;
     set.particles.resample_ess_ratio = 1.0;
     set.beams.deskew = false;
-    set.motion.alpha_1_tum = reference.alpha_1_tum;
-    set.motion.alpha_2_tum = reference.alpha_2_tum;
-    set.motion.alpha_3_tum = reference.alpha_3_tum;
-    set.motion.alpha_4_tum = reference.alpha_4_tum;
+    set.motion.noise.alpha_1_tum = reference.noise.alpha_1_tum;
+    set.motion.noise.alpha_2_tum = reference.noise.alpha_2_tum;
+    set.motion.noise.alpha_3_tum = reference.noise.alpha_3_tum;
+    set.motion.noise.alpha_4_tum = reference.noise.alpha_4_tum;
     set.motion.diffusion_xy = 0.0;
     set.motion.diffusion_heading = 0.0;
     set.motion.learn_slip = false;

@@ -14,11 +14,10 @@
 //! use synpf::{Odometry, Parameters, Scan, Stamp, SynPf, TrackMap, Twist};
 //!
 //! // A room of 6 x 4 m in cells of 5 cm.
-//! let cells = (0..120 * 80).map(|i| match (i % 120, i / 120) {
+//! let grid = OccupancyGrid::from_fn(120, 80, 0.05, Pose::IDENTITY, |column, row| match (column, row) {
 //!     (0 | 119, _) | (_, 0 | 79) => Cell::Occupied,
 //!     _ => Cell::Free,
 //! });
-//! let grid = OccupancyGrid::new(120, 80, 0.05, Pose::IDENTITY, cells.collect());
 //! let map = Arc::new(TrackMap::new(grid)?);
 //! let base_link_from_laser = Pose::new(0.27, 0.0, 0.0);
 //! let mut localizer = SynPf::new(Arc::clone(&map), base_link_from_laser, Parameters::default(), 1)?;
@@ -63,6 +62,7 @@ mod global_search;
 mod innovation_gate;
 mod likelihood_field;
 mod motion_model;
+mod motion_noise;
 mod normal_pool;
 mod odometry_track;
 mod parameters;
@@ -102,6 +102,7 @@ pub use localizer::{
     SensorFindings, Stamp, Twist, Update, WeightedPose, YawRate,
 };
 pub use motion_model::{MotionModel, MotionParameters};
+pub use motion_noise::MotionNoise;
 pub use parameters::{Parameters, parameter_table};
 pub use particles::ParticleParameters;
 pub use recovery::RecoveryParameters;

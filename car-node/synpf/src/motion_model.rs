@@ -7,6 +7,7 @@
 use maps::Pose;
 use serde::{Deserialize, Serialize};
 
+use crate::motion_noise::MotionNoise;
 use crate::validation::Check;
 
 /// Which motion model moves the particles.
@@ -33,50 +34,9 @@ pub struct MotionParameters {
     pub motion_model: MotionModel,
     /// The interval that the parameters of the four models refer to \[s\]: one message of odometry at 50 Hz.
     pub noise_interval: f64,
-    /// `tum`: standard deviation of a rotation per rotation [rad/rad] (Stahl et al., IV 2019, as all of `tum`).
-    pub alpha_1_tum: f64,
-    /// `tum`: standard deviation of a rotation times the translation per interval [rad m].
-    pub alpha_2_tum: f64,
-    /// `tum`: standard deviation of the translation per translation [m/m].
-    pub alpha_3_tum: f64,
-    /// `tum`: standard deviation of the translation per rotation [m/rad].
-    pub alpha_4_tum: f64,
-    /// `tum`: least translation per interval that `alpha_2_tum` is divided by \[m\].
-    pub lam_thresh: f64,
-    /// `amcl`: variance of a rotation per squared rotation [rad^2/rad^2] (table 5.6, and AMCL's `alpha1`). The reference
-    /// adds standard deviations instead of variances, so its values have to be squared; this goes for all four.
-    pub alpha_1_amcl: f64,
-    /// `amcl`: variance of a rotation per squared translation [rad^2/m^2] (AMCL's `alpha2`).
-    pub alpha_2_amcl: f64,
-    /// `amcl`: variance of the translation per squared translation [m^2/m^2] (AMCL's `alpha3`).
-    pub alpha_3_amcl: f64,
-    /// `amcl`: variance of the translation per squared rotation [m^2/rad^2] (AMCL's `alpha4`). AMCL's `alpha5` belongs to
-    /// its model of omnidirectional robots.
-    pub alpha_4_amcl: f64,
-    /// `arc`: standard deviation of the forward motion per forward motion [m/m] (all of `arc` as in the reference's file).
-    pub motion_dispersion_arc_x: f64,
-    /// `arc`: standard deviation of the sideways motion per sideways motion [m/m].
-    pub motion_dispersion_arc_y: f64,
-    /// `arc`: standard deviation of the turn per turn [rad/rad].
-    pub motion_dispersion_arc_theta: f64,
-    /// `arc`: standard deviation of the sideways motion per forward motion [m/m].
-    pub motion_dispersion_arc_xy: f64,
-    /// `arc`: least standard deviation of the forward motion \[m\].
-    pub motion_dispersion_arc_x_min: f64,
-    /// `arc`: least standard deviation of the sideways motion \[m\].
-    pub motion_dispersion_arc_y_min: f64,
-    /// `arc`: greatest standard deviation of the sideways motion \[m\].
-    pub motion_dispersion_arc_y_max: f64,
-    /// `arc`: least standard deviation of the turn \[rad\].
-    pub motion_dispersion_arc_theta_min: f64,
-    /// `arc`: forward motion per interval up to which `motion_dispersion_arc_xy` adds nothing \[m\].
-    pub motion_dispersion_arc_xy_min_x: f64,
-    /// `mit`: standard deviation of the forward motion \[m\] (all of `mit` as in MIT's particle filter).
-    pub motion_dispersion_x: f64,
-    /// `mit`: standard deviation of the sideways motion \[m\].
-    pub motion_dispersion_y: f64,
-    /// `mit`: standard deviation of the turn \[rad\].
-    pub motion_dispersion_theta: f64,
+    /// The noise of each model.
+    #[serde(flatten)]
+    pub noise: MotionNoise,
     /// Noise on the position that every model adds [m/sqrt(s)], so that copies of a particle separate.
     pub diffusion_xy: f64,
     /// Noise on the heading that every model adds [rad/sqrt(s)].
@@ -100,27 +60,7 @@ impl Default for MotionParameters {
         Self {
             motion_model: MotionModel::Tum,
             noise_interval: 0.02,
-            alpha_1_tum: 0.3,
-            alpha_2_tum: 0.002,
-            alpha_3_tum: 0.3,
-            alpha_4_tum: 0.05,
-            lam_thresh: 0.1,
-            alpha_1_amcl: 0.25,
-            alpha_2_amcl: 0.25,
-            alpha_3_amcl: 0.09,
-            alpha_4_amcl: 0.01,
-            motion_dispersion_arc_x: 0.3,
-            motion_dispersion_arc_y: 0.5,
-            motion_dispersion_arc_theta: 0.5,
-            motion_dispersion_arc_xy: 0.2,
-            motion_dispersion_arc_x_min: 0.01,
-            motion_dispersion_arc_y_min: 0.01,
-            motion_dispersion_arc_y_max: 1.0,
-            motion_dispersion_arc_theta_min: 0.01,
-            motion_dispersion_arc_xy_min_x: 0.02,
-            motion_dispersion_x: 0.05,
-            motion_dispersion_y: 0.025,
-            motion_dispersion_theta: 0.05,
+            noise: MotionNoise::default(),
             diffusion_xy: 0.02,
             diffusion_heading: 0.1,
             odometry_speed_error: 0.06,
@@ -136,37 +76,7 @@ impl Default for MotionParameters {
 impl MotionParameters {
     pub(crate) fn validate(&self, check: &mut Check) {
         check.range("noise_interval", self.noise_interval, 1e-3, 1.0);
-        for (key, value) in [
-            ("alpha_1_tum", self.alpha_1_tum),
-            ("alpha_2_tum", self.alpha_2_tum),
-            ("alpha_3_tum", self.alpha_3_tum),
-            ("alpha_4_tum", self.alpha_4_tum),
-            ("alpha_1_amcl", self.alpha_1_amcl),
-            ("alpha_2_amcl", self.alpha_2_amcl),
-            ("alpha_3_amcl", self.alpha_3_amcl),
-            ("alpha_4_amcl", self.alpha_4_amcl),
-            ("motion_dispersion_arc_x", self.motion_dispersion_arc_x),
-            ("motion_dispersion_arc_y", self.motion_dispersion_arc_y),
-            ("motion_dispersion_arc_theta", self.motion_dispersion_arc_theta),
-            ("motion_dispersion_arc_xy", self.motion_dispersion_arc_xy),
-            ("motion_dispersion_arc_x_min", self.motion_dispersion_arc_x_min),
-            ("motion_dispersion_arc_y_min", self.motion_dispersion_arc_y_min),
-            ("motion_dispersion_arc_y_max", self.motion_dispersion_arc_y_max),
-            (
-                "motion_dispersion_arc_theta_min",
-                self.motion_dispersion_arc_theta_min,
-            ),
-            (
-                "motion_dispersion_arc_xy_min_x",
-                self.motion_dispersion_arc_xy_min_x,
-            ),
-            ("motion_dispersion_x", self.motion_dispersion_x),
-            ("motion_dispersion_y", self.motion_dispersion_y),
-            ("motion_dispersion_theta", self.motion_dispersion_theta),
-        ] {
-            check.range(key, value, 0.0, 10.0);
-        }
-        check.range("lam_thresh", self.lam_thresh, 1e-3, 10.0);
+        self.noise.validate(check);
         check.range("diffusion_xy", self.diffusion_xy, 0.0, 1.0);
         check.range("diffusion_heading", self.diffusion_heading, 0.0, 1.0);
         check.range("odometry_speed_error", self.odometry_speed_error, 1e-3, 2.0);
@@ -206,17 +116,17 @@ impl Motion {
         let with_floor = |sigma: f64, floor: f64| (sigma * grow).hypot(floor) as f32;
         match parameters.motion_model {
             MotionModel::Tum | MotionModel::Amcl => {
+                let p = &parameters.noise;
                 let (rot1, trans, rot2) = rotate_drive_rotate(delta);
                 let (step, turn1, turn2) = (per(trans), per(rot1), per(rot2));
                 let (sigma1, sigma2, sigma_trans) = if parameters.motion_model == MotionModel::Tum {
-                    let slow = parameters.alpha_2_tum / step.max(parameters.lam_thresh);
+                    let slow = p.alpha_2_tum / step.max(p.lam_thresh);
                     (
-                        parameters.alpha_1_tum * turn1 + slow,
-                        parameters.alpha_1_tum * turn2 + slow,
-                        parameters.alpha_3_tum * step + parameters.alpha_4_tum * (turn1 + turn2),
+                        p.alpha_1_tum * turn1 + slow,
+                        p.alpha_1_tum * turn2 + slow,
+                        p.alpha_3_tum * step + p.alpha_4_tum * (turn1 + turn2),
                     )
                 } else {
-                    let p = parameters;
                     let [turn1, turn2, step] = [turn1, turn2, step].map(|v| v * v);
                     (
                         (p.alpha_1_amcl * turn1 + p.alpha_2_amcl * step).sqrt(),
@@ -234,7 +144,7 @@ impl Motion {
                 }
             }
             MotionModel::Arc => {
-                let p = parameters;
+                let p = &parameters.noise;
                 let (x, y, turn) = (per(delta.x), per(delta.y), per(delta.heading));
                 let from_x = if x > p.motion_dispersion_arc_xy_min_x {
                     p.motion_dispersion_arc_xy * x
@@ -263,9 +173,9 @@ impl Motion {
             MotionModel::Mit => Self::Body {
                 mean: [delta.x, delta.y, delta.heading].map(|v| v as f32),
                 sigma: [
-                    with_floor(parameters.motion_dispersion_x, floor_xy),
-                    with_floor(parameters.motion_dispersion_y, floor_xy),
-                    with_floor(parameters.motion_dispersion_theta, floor_heading),
+                    with_floor(parameters.noise.motion_dispersion_x, floor_xy),
+                    with_floor(parameters.noise.motion_dispersion_y, floor_xy),
+                    with_floor(parameters.noise.motion_dispersion_theta, floor_heading),
                 ],
             },
         }
@@ -352,10 +262,13 @@ mod tests {
         let delta = Pose::new(trans * rot1.cos(), trans * rot1.sin(), rot1 + rot2);
         let parameters = MotionParameters {
             motion_model: MotionModel::Amcl,
-            alpha_1_amcl: 0.2,
-            alpha_2_amcl: 0.3,
-            alpha_3_amcl: 0.5,
-            alpha_4_amcl: 0.7,
+            noise: MotionNoise {
+                alpha_1_amcl: 0.2,
+                alpha_2_amcl: 0.3,
+                alpha_3_amcl: 0.5,
+                alpha_4_amcl: 0.7,
+                ..MotionNoise::default()
+            },
             diffusion_xy: 0.0,
             diffusion_heading: 0.0,
             ..MotionParameters::default()

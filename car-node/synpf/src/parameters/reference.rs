@@ -67,7 +67,7 @@ mod tests {
         assert_eq!(set.sensor.range_method, RangeMethod::Cddt);
         assert_eq!(set.motion.motion_model, MotionModel::Mit);
         assert!((set.particles.initial_std_heading - 0.3).abs() < 1e-12);
-        assert!((set.motion.alpha_3_tum - 0.7).abs() < 1e-12);
+        assert!((set.motion.noise.alpha_3_tum - 0.7).abs() < 1e-12);
         assert_eq!(unknown, ["max_viz_particles", "rangelib_variant"]);
     }
 

@@ -63,9 +63,9 @@ impl Motion {
             ReferenceMotionModel::Arc => arc(step, messages, parameters),
             ReferenceMotionModel::Default => {
                 let sigma = [
-                    parameters.motion_dispersion_x,
-                    parameters.motion_dispersion_y,
-                    parameters.motion_dispersion_theta,
+                    parameters.noise.motion_dispersion_x,
+                    parameters.noise.motion_dispersion_y,
+                    parameters.noise.motion_dispersion_theta,
                 ];
                 Self::Body {
                     mean: components(step.action(parameters)),
@@ -154,8 +154,8 @@ fn polar(step: &Step, messages: f64, parameters: &ReferenceParameters) -> Motion
         [rot1, trans, rot2]
     };
     let (turn1, drive, turn2) = (fold1 / messages, trans / messages, fold2 / messages);
-    let p = parameters;
-    let sigma = if p.motion_model == ReferenceMotionModel::Amcl {
+    let p = &parameters.noise;
+    let sigma = if parameters.motion_model == ReferenceMotionModel::Amcl {
         [
             p.alpha_1_amcl * turn1 + p.alpha_2_amcl * drive,
             p.alpha_3_amcl * drive + p.alpha_4_amcl * (turn1 + turn2),
@@ -189,8 +189,8 @@ fn folded(rotation: f64) -> f64 {
 }
 
 fn arc(step: &Step, messages: f64, parameters: &ReferenceParameters) -> Motion {
-    let p = parameters;
-    let mean = components(step.action(p));
+    let p = &parameters.noise;
+    let mean = components(step.action(parameters));
     let [x, y, turn] = mean.map(|v| v.abs() / messages);
     let from_x = p.motion_dispersion_arc_xy * (x - p.motion_dispersion_arc_xy_min_x).max(0.0);
     let sigma = [
@@ -203,7 +203,7 @@ fn arc(step: &Step, messages: f64, parameters: &ReferenceParameters) -> Motion {
     Motion::Arc {
         mean,
         sigma: sigma.map(|v| v * messages.sqrt()),
-        mirrored: p.defects.defect_mirrored_arc,
+        mirrored: parameters.defects.defect_mirrored_arc,
     }
 }
 

@@ -4,6 +4,7 @@ use localizer::{ParameterFault, ParameterValues, overlay, to_values};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::motion_noise::MotionNoise;
 use crate::validation::Check;
 
 /// Which motion model moves the particles.
@@ -57,48 +58,9 @@ pub struct ReferenceParameters {
     pub lambda_short: f64,
     /// Which motion model moves the particles.
     pub motion_model: ReferenceMotionModel,
-    /// `tum`: rotation noise from rotation [rad/rad].
-    pub alpha_1_tum: f64,
-    /// `tum`: rotation noise from slowness [rad m].
-    pub alpha_2_tum: f64,
-    /// `tum`: translation noise from translation [m/m].
-    pub alpha_3_tum: f64,
-    /// `tum`: translation noise from rotation [m/rad].
-    pub alpha_4_tum: f64,
-    /// `tum`: translation per message below which `alpha_2_tum` stops growing \[m\].
-    pub lam_thresh: f64,
-    /// `amcl`: rotation noise from rotation [rad/rad].
-    pub alpha_1_amcl: f64,
-    /// `amcl`: rotation noise from translation [rad/m].
-    pub alpha_2_amcl: f64,
-    /// `amcl`: translation noise from translation [m/m].
-    pub alpha_3_amcl: f64,
-    /// `amcl`: translation noise from rotation [m/rad].
-    pub alpha_4_amcl: f64,
-    /// `arc`: forward noise from forward motion [m/m].
-    pub motion_dispersion_arc_x: f64,
-    /// `arc`: sideways noise from sideways motion [m/m].
-    pub motion_dispersion_arc_y: f64,
-    /// `arc`: turning noise from turning [rad/rad].
-    pub motion_dispersion_arc_theta: f64,
-    /// `arc`: sideways noise from forward motion beyond `motion_dispersion_arc_xy_min_x` [m/m].
-    pub motion_dispersion_arc_xy: f64,
-    /// `arc`: least forward noise \[m\].
-    pub motion_dispersion_arc_x_min: f64,
-    /// `arc`: least sideways noise \[m\].
-    pub motion_dispersion_arc_y_min: f64,
-    /// `arc`: most sideways noise \[m\].
-    pub motion_dispersion_arc_y_max: f64,
-    /// `arc`: least turning noise \[rad\].
-    pub motion_dispersion_arc_theta_min: f64,
-    /// `arc`: forward motion below which it adds no sideways noise \[m\].
-    pub motion_dispersion_arc_xy_min_x: f64,
-    /// `default`: noise along the map's x axis \[m\].
-    pub motion_dispersion_x: f64,
-    /// `default`: noise along the map's y axis \[m\].
-    pub motion_dispersion_y: f64,
-    /// `default`: turning noise \[rad\].
-    pub motion_dispersion_theta: f64,
+    /// The noise of each motion model.
+    #[serde(flatten)]
+    pub noise: MotionNoise,
     /// Its defects, all on as shipped.
     #[serde(flatten)]
     pub defects: ReferenceDefects,
@@ -172,27 +134,7 @@ impl Default for ReferenceParameters {
             sigma_hit: 0.1,
             lambda_short: 0.25,
             motion_model: ReferenceMotionModel::Tum,
-            alpha_1_tum: 0.5,
-            alpha_2_tum: 0.015,
-            alpha_3_tum: 1.0,
-            alpha_4_tum: 0.1,
-            lam_thresh: 0.1,
-            alpha_1_amcl: 0.5,
-            alpha_2_amcl: 0.5,
-            alpha_3_amcl: 1.0,
-            alpha_4_amcl: 0.1,
-            motion_dispersion_arc_x: 0.8,
-            motion_dispersion_arc_y: 1.0,
-            motion_dispersion_arc_theta: 0.75,
-            motion_dispersion_arc_xy: 1.0,
-            motion_dispersion_arc_x_min: 0.01,
-            motion_dispersion_arc_y_min: 0.03,
-            motion_dispersion_arc_y_max: 1.0,
-            motion_dispersion_arc_theta_min: 0.01,
-            motion_dispersion_arc_xy_min_x: 0.10,
-            motion_dispersion_x: 0.05,
-            motion_dispersion_y: 0.025,
-            motion_dispersion_theta: 0.25,
+            noise: MotionNoise::REFERENCE,
             defects: ReferenceDefects::default(),
         }
     }
@@ -244,37 +186,7 @@ impl ReferenceParameters {
         check.range("z_rand", self.z_rand, 1e-9, 1.0);
         check.range("sigma_hit", self.sigma_hit, 0.005, 5.0);
         check.range("lambda_short", self.lambda_short, 1e-3, 100.0);
-        for (key, value) in [
-            ("alpha_1_tum", self.alpha_1_tum),
-            ("alpha_2_tum", self.alpha_2_tum),
-            ("alpha_3_tum", self.alpha_3_tum),
-            ("alpha_4_tum", self.alpha_4_tum),
-            ("alpha_1_amcl", self.alpha_1_amcl),
-            ("alpha_2_amcl", self.alpha_2_amcl),
-            ("alpha_3_amcl", self.alpha_3_amcl),
-            ("alpha_4_amcl", self.alpha_4_amcl),
-            ("motion_dispersion_arc_x", self.motion_dispersion_arc_x),
-            ("motion_dispersion_arc_y", self.motion_dispersion_arc_y),
-            ("motion_dispersion_arc_theta", self.motion_dispersion_arc_theta),
-            ("motion_dispersion_arc_xy", self.motion_dispersion_arc_xy),
-            ("motion_dispersion_arc_x_min", self.motion_dispersion_arc_x_min),
-            ("motion_dispersion_arc_y_min", self.motion_dispersion_arc_y_min),
-            ("motion_dispersion_arc_y_max", self.motion_dispersion_arc_y_max),
-            (
-                "motion_dispersion_arc_theta_min",
-                self.motion_dispersion_arc_theta_min,
-            ),
-            (
-                "motion_dispersion_arc_xy_min_x",
-                self.motion_dispersion_arc_xy_min_x,
-            ),
-            ("motion_dispersion_x", self.motion_dispersion_x),
-            ("motion_dispersion_y", self.motion_dispersion_y),
-            ("motion_dispersion_theta", self.motion_dispersion_theta),
-        ] {
-            check.range(key, value, 0.0, 10.0);
-        }
-        check.range("lam_thresh", self.lam_thresh, 1e-3, 10.0);
+        self.noise.validate(&mut check);
         if check.0.is_empty() { Ok(()) } else { Err(check.0) }
     }
 }

@@ -301,8 +301,8 @@ pub(super) mod tests {
     use std::borrow::Cow;
     use std::io::Cursor;
 
-    /// An event that arrived at `number` \[unix ns\].
-    fn event(number: u64) -> FleetEvent {
+    /// Event `number` of a car, which arrived at `number` \[unix ns\]; its bytes have the version that `version` gives.
+    pub(in super::super) fn event(number: u64, version: Option<u16>) -> FleetEvent {
         let event = Event {
             kind: EventKind::SearchStarted,
             update: number,
@@ -314,8 +314,12 @@ pub(super) mod tests {
             sequence: number + 1,
             ..Stamps::default()
         };
-        let bytes = encode(&event, stamps).expect("a good message");
+        let mut bytes = encode(&event, stamps).expect("a good message");
         let (header, _) = decode::<Event>(&bytes).expect("our own");
+        if let Some(version) = version {
+            // Behind the magic and the schema.
+            bytes[6..8].copy_from_slice(&version.to_le_bytes());
+        }
         FleetEvent {
             at: number as i64,
             car: "car-1".parse().expect("a name"),
@@ -333,7 +337,7 @@ pub(super) mod tests {
     pub(in super::super) fn small_recording() -> Vec<u8> {
         let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("begun");
         for number in 0..100 {
-            recording.write(&event(number)).expect("written");
+            recording.write(&event(number, None)).expect("written");
             if number % 10 == 9 {
                 recording.flush().expect("flushed");
             }

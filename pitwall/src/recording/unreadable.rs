@@ -71,39 +71,10 @@ impl UnreadableCount {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::recording::reader::tests::event;
     use crate::recording::writer::RecordingWriter;
-    use crate::{Delivery, Replay, Report, read_events};
-    use protocol::{Event, EventKind, Stamps, Telemetry, encode};
+    use crate::{Replay, Report, read_events};
     use std::sync::Arc;
-
-    fn event(number: u64, version: u16) -> FleetEvent {
-        let event = Event {
-            kind: EventKind::SearchStarted,
-            update: number,
-            who: None,
-            command: None,
-        };
-        let stamps = Stamps {
-            run_id: 1,
-            sequence: number,
-            ..Stamps::default()
-        };
-        let mut bytes = encode(&event, stamps).expect("a good message");
-        let (header, _) = protocol::decode::<Event>(&bytes).expect("our own");
-        // Behind the magic and the schema.
-        bytes[6..8].copy_from_slice(&version.to_le_bytes());
-        FleetEvent {
-            at: 1_000_000_000 + number as i64,
-            car: "car-1".parse().expect("a name"),
-            payload: EventPayload::Message {
-                topic: Topic::Event,
-                delivery: Delivery::InOrder,
-                header,
-                telemetry: Box::new(Telemetry::Event(event)),
-                bytes: bytes.into(),
-            },
-        }
-    }
 
     #[test]
     fn messages_of_another_version_are_left_out_and_reported() {
@@ -112,10 +83,10 @@ mod tests {
         let file = std::fs::File::create(&path).expect("a file");
         let mut recording = RecordingWriter::new(file).expect("begun");
         for (number, version) in [(1, 1), (2, 99), (3, 2), (4, 99), (5, 3)] {
-            recording.write(&event(number, version)).expect("written");
+            recording.write(&event(number, Some(version))).expect("written");
         }
         // One that the pit wall that recorded could not read either.
-        let mut unread = event(6, 1);
+        let mut unread = event(6, None);
         if let EventPayload::Message { topic, header, .. } = unread.payload {
             unread.payload = EventPayload::Unreadable {
                 topic,
@@ -124,7 +95,7 @@ mod tests {
             };
         }
         recording.write(&unread).expect("written");
-        recording.write(&event(8, 3)).expect("written");
+        recording.write(&event(8, None)).expect("written");
         recording.finish().expect("ended");
 
         let read: Vec<_> = read_events(&path)

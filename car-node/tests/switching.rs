@@ -3,6 +3,9 @@
 //! The car drives on the filter's estimates. The test waits for the filter after each odometry message, so that the
 //! load of the machine has no effect.
 
+#[path = "common/circuit.rs"]
+mod circuit;
+
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,28 +22,12 @@ use car_node::sensors::bag::SensorEvent;
 use car_node::sensors::clock::SensorClock;
 use car_node::sensors::{Feed, Next, PoseEstimate, Race, Source};
 use car_node::telemetry::shared_state::SharedState;
+use circuit::circuit;
 use crossbeam_channel::{Sender, bounded};
 use maps::Pose;
 use protocol::{Action, Answer, Command, CommandId, Outcome, ParamsAction, Stamps, Topic, decode, encode};
 use simulator::{CarSetup, Grip, Track, YawSource};
 use synpf::{Stamp, TrackMap};
-
-/// Passes through every ordered pair of the four sets once.
-const CIRCUIT: [&str; 13] = [
-    "hq",
-    "lq",
-    "hq",
-    "adaptive",
-    "hq",
-    "synpf-baseline",
-    "lq",
-    "adaptive",
-    "lq",
-    "synpf-baseline",
-    "adaptive",
-    "synpf-baseline",
-    "hq",
-];
 
 /// The car drives this long before the first switch, and then under each set \[s\].
 const BEFORE: f64 = 4.0;
@@ -62,8 +49,13 @@ struct Car {
 }
 
 impl Car {
-    fn start(map: &Arc<TrackMap>, base_link_from_laser: Pose, begin: Pose, now: Stamp) -> Self {
-        let name = CIRCUIT[0];
+    fn start(
+        name: &'static str,
+        map: &Arc<TrackMap>,
+        base_link_from_laser: Pose,
+        begin: Pose,
+        now: Stamp,
+    ) -> Self {
         let set = LocalizerParameters::named(name).expect("ships");
         set.prepare_tables(map, Some(begin));
         let mut localizer = set.build(map, base_link_from_laser, 1).expect("sound");
@@ -169,7 +161,14 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
     let map = Arc::new(TrackMap::new(track.grid.clone()).expect("free cells"));
     let mut source = Race::new(track, vec![car_on_taped_tyres()], 1, Vec::new()).car(0);
     let begin = source.start().expect("known");
-    let mut car = Car::start(&map, source.mount().base_link_from_laser, begin, Stamp(0));
+    let sets = circuit(&LocalizerParameters::NAMES);
+    let mut car = Car::start(
+        sets[0],
+        &map,
+        source.mount().base_link_from_laser,
+        begin,
+        Stamp(0),
+    );
 
     let (mut truth, mut estimates) = (Vec::new(), Vec::new());
     let (mut begun, mut latest, mut scans) = (None, None, 0);
@@ -197,7 +196,7 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
                 estimates.push((under, estimate));
                 if elapsed > BEFORE + UNDER_EACH * under as f64 {
                     under += 1;
-                    let Some(name) = CIRCUIT.get(under) else { break };
+                    let Some(name) = sets.get(under) else { break };
                     first_updates.push(car.select(name));
                 }
             }
@@ -206,13 +205,13 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
             | Feed::GlobalSearch { .. }
             | Feed::Clock { .. }
             | Feed::Mount { .. } => {
-                panic!("the recovery crew had to come under {}", CIRCUIT[under])
+                panic!("the recovery crew had to come under {}", sets[under])
             }
         }
     }
     car.stop();
 
-    assert_eq!(first_updates.len(), CIRCUIT.len() - 1);
+    assert_eq!(first_updates.len(), sets.len() - 1);
     assert!(first_updates.is_sorted_by(|a, b| a < b), "{first_updates:?}");
     let truth = Truth::new(truth);
     let distance = truth_length(&truth, &estimates);
@@ -222,7 +221,7 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
             continue;
         };
         let error = estimate.pose.distance(pose);
-        let pair = [under.saturating_sub(1), under].map(|index| CIRCUIT[index]);
+        let pair = [under.saturating_sub(1), under].map(|index| sets[index]);
         assert!(error < NEAR, "{error:.2} m off after {pair:?}");
     }
 }

@@ -1,8 +1,13 @@
 //! Commands under faults: the car always ends in a known state, and the operator is told which.
 
+#[path = "../../car-node/tests/common/circuit.rs"]
+mod circuit;
+
 use std::sync::Arc;
 use std::time::Duration;
 
+use car_node::localization::LocalizerParameters;
+use circuit::circuit;
 use pitwall::{FleetService, Verdict, new_command_id};
 use protocol::{
     Action, Command, Key, Outcome, ParameterSet, ParamsAction, Pose2, Rates, RatesAction, Stamps, Telemetry,
@@ -20,23 +25,6 @@ fn revision(verdict: &Verdict) -> u64 {
     }
 }
 
-/// Passes through every ordered pair of the built-in sets once.
-const CIRCUIT: [&str; 13] = [
-    "hq",
-    "lq",
-    "hq",
-    "adaptive",
-    "hq",
-    "synpf-baseline",
-    "lq",
-    "adaptive",
-    "lq",
-    "synpf-baseline",
-    "adaptive",
-    "synpf-baseline",
-    "hq",
-];
-
 #[tokio::test(flavor = "multi_thread")]
 async fn every_pair_of_sets_is_switched_from_the_pit_wall_and_the_updates_count_on() {
     // Two of the pairs' kinds of localizer differ. `car-node/tests/switching.rs` holds the pose on the same circuit.
@@ -53,7 +41,8 @@ async fn every_pair_of_sets_is_switched_from_the_pit_wall_and_the_updates_count_
     };
     wait_until("the car drives", || pose().is_some_and(|pose| pose.update > 40)).await;
     let mut last = 0;
-    for (from, to) in CIRCUIT.iter().zip(&CIRCUIT[1..]) {
+    for pair in circuit(&LocalizerParameters::NAMES).windows(2) {
+        let [from, to] = pair else { continue };
         let verdict = send_command(&service, &car, "ana", None, select(to)).await;
         let Verdict::Answered { answer, .. } = &verdict else {
             panic!("{from} to {to}: {verdict:?}");

@@ -6,10 +6,10 @@ use protocol::{Answer, CommandId};
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::xxh3_64;
 
-/// Answers that are kept: an operator repeats a command within seconds, not after hundreds of others.
+/// Most answers that are kept. An operator repeats a command within seconds, so older answers are not needed.
 const MOST: usize = 512;
 
-/// Hash of a command's payload. It tells two commands under one id apart.
+/// Hash of a command's payload. Two commands under one id have different hashes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PayloadHash(u64);
 
@@ -46,7 +46,7 @@ impl AnswerCache {
         self.0.iter().rev().find(|cached| cached.answer.id == id)
     }
 
-    /// Adds an answer; the oldest goes when there are too many.
+    /// Adds an answer, and removes the oldest one if there are too many.
     pub(super) fn push(&mut self, answer: CachedAnswer) {
         if self.0.len() >= MOST {
             self.0.pop_front();

@@ -12,7 +12,7 @@ use super::command_handler::{CommandHandler, CommandHandlerConfig};
 use super::local_commands::LocalRequest;
 use super::request::Request;
 
-/// The handler's deadlines are checked this often.
+/// The interval at which the handler checks its deadlines.
 const TICK: Duration = Duration::from_millis(50);
 
 /// Starts the thread. With a verifier only signed commands are executed. It ends when `stop` is dropped.

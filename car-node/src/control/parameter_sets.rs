@@ -11,7 +11,7 @@ use synpf::ParameterFault;
 use crate::localization::{KIND_KEY, LocalizerParameters};
 use crate::wire;
 
-/// A set as it was found.
+/// A set with its name, from those that ship or from a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedSet {
     /// The set's name: the shipped one's, or the file's without its extension.
@@ -22,16 +22,16 @@ pub struct NamedSet {
     pub unknown_keys: Vec<String>,
 }
 
-/// Why a set cannot be had.
+/// Why a set cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum SetError {
     /// Neither a shipped set nor a file.
     #[error("no parameter set {0:?}: neither a file nor one of {names}", names = LocalizerParameters::NAMES.join(", "))]
     Unknown(String),
-    /// The file does not read.
+    /// The file cannot be read.
     #[error(transparent)]
     Read(#[from] MapError),
-    /// The file's values are refused, all of the faults.
+    /// Values in the file are refused; lists every fault.
     #[error("{path}: {}", .faults.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Faults {
         /// The file.
@@ -89,7 +89,7 @@ pub fn values(parameters: &LocalizerParameters) -> BTreeMap<String, Value> {
     parameters.to_values()
 }
 
-/// `base` with some values replaced. Refused whole, with every fault: an unknown key is one.
+/// `base` with some values replaced. One fault refuses the whole change; an unknown key is a fault. Every fault is listed.
 pub fn with_values(
     base: &LocalizerParameters,
     given: impl IntoIterator<Item = (String, Value)>,

@@ -1,6 +1,7 @@
 //! The parameter sets of a car: which exist, which one is in force, which trial is pending.
 //!
-//! Pure: the caller swaps the set in the filter, writes the file and passes the time. A change takes two steps.
+//! It has no clock and no file: the caller swaps the set in the filter, writes the file and passes the time. A change takes
+//! two steps.
 //! [`ParameterStore::plan`] checks it and changes nothing. After the filter has swapped the set,
 //! [`ParameterStore::commit`] puts it in force.
 
@@ -66,7 +67,7 @@ pub enum Decision {
 /// Why a command about sets is refused.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Refusal {
-    /// Every fault.
+    /// All faults of the values.
     Faults(Vec<String>),
     /// The command expects another revision than the one in force.
     Stale {
@@ -75,7 +76,7 @@ pub enum Refusal {
     },
 }
 
-/// A longer `revert_after` is taken for a mistake \[s\].
+/// Longest `revert_after` that is accepted \[s\].
 const LONGEST_TRIAL: f64 = 3600.0;
 /// Most sets on one car.
 const MOST_SETS: usize = 64;
@@ -128,7 +129,7 @@ impl ParameterStore {
         LocalizerParameters::NAMES.into_iter().chain(external)
     }
 
-    /// What must survive a restart.
+    /// The state that must survive a restart.
     pub fn persisted(&self) -> &PersistedState {
         &self.persisted
     }
@@ -159,7 +160,7 @@ impl ParameterStore {
         }
     }
 
-    /// When the pending trial reverts.
+    /// The time at which the pending trial reverts.
     pub fn reverts_at(&self) -> Option<Stamp> {
         self.pending.as_ref().map(|pending| pending.at)
     }
@@ -525,7 +526,7 @@ mod tests {
         assert_eq!(store.reference().name, "lq");
         assert!(
             store.plan(&ParamsAction::List, Some(seen)).is_ok(),
-            "looking is always allowed"
+            "a listing is always allowed"
         );
     }
 
@@ -534,7 +535,7 @@ mod tests {
         let mut store = store();
         change(&mut store, &select("lq", Some(5000)), NOW);
         assert_eq!(store.persisted().settled.as_deref(), Some("hq"));
-        // A trial within a trial goes back to where both began.
+        // A trial within a trial reverts to the set before both.
         change(&mut store, &select("adaptive", Some(5000)), NOW.plus(1.0));
         assert_eq!(store.revert_due(NOW.plus(5.9)), None);
         let plan = store.revert_due(NOW.plus(6.0)).expect("due");
@@ -548,7 +549,7 @@ mod tests {
         assert_eq!(store.persisted().settled.as_deref(), Some("lq"));
         assert!(
             store.plan(&ParamsAction::Confirm, None).is_err(),
-            "once is enough"
+            "it is confirmed already"
         );
     }
 
@@ -607,7 +608,7 @@ mod tests {
         }
     }
 
-    /// Numbers without an end, the same in every run.
+    /// Pseudo-random numbers, the same in every run.
     struct Dice(u64);
 
     impl Dice {
@@ -616,7 +617,7 @@ mod tests {
             (self.0 >> 33) as usize % sides
         }
 
-        /// A command about sets, sensible or absurd: known and unknown keys with any value.
+        /// A random command about sets, with known and unknown keys and with any value.
         fn action(&mut self, keys: &[String]) -> ParamsAction {
             let name = ["hq", "lq", "mine", "yours", "wet", "-"][self.roll(6)].to_owned();
             let revert_after_ms = [None, Some(0), Some(500), Some(u32::MAX)][self.roll(4)];
@@ -659,8 +660,8 @@ mod tests {
         }
     }
 
-    /// Whatever is asked in whatever order: what is refused changes nothing, what is done counts up by one, and what is in
-    /// force is always a sound set.
+    /// For random commands in random order: a refused command changes nothing, an executed one raises the revision by one,
+    /// and the set in force is always valid.
     #[test]
     fn no_sequence_of_commands_leads_astray() {
         let mut keys: Vec<String> = parameter_sets::values(&LocalizerParameters::default())

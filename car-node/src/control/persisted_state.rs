@@ -1,4 +1,4 @@
-//! What survives a restart of the car.
+//! The state of a car that survives a restart.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -37,7 +37,7 @@ pub struct PersistedState {
 }
 
 impl PersistedState {
-    /// Keeps an answer over a restart; the oldest goes when there are too many.
+    /// Keeps an answer over a restart, and removes the oldest one if there are too many.
     pub fn push_answer(&mut self, answer: CachedAnswer) {
         if self.answers.len() >= MOST_ANSWERS {
             self.answers.pop_front();

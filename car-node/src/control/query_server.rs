@@ -1,4 +1,4 @@
-//! The thread that replies to queries which change nothing: the map, what runs here, and telemetry that did not arrive.
+//! The thread that replies to queries that change nothing: the map, the versions that run here, and missing telemetry.
 //!
 //! It is separate from the command server, so that a map on its way over a slow link delays no command.
 
@@ -14,14 +14,14 @@ use crate::sensors::clock::wall_now;
 use crate::telemetry::replay_buffer::ReplayBuffer;
 use crate::telemetry::shared_state::SharedState;
 
-/// What the replies are made from.
+/// The data that replies are made from.
 #[derive(Debug)]
 pub struct QueryServer {
     /// The reply to `map`, encoded.
     pub map: Vec<u8>,
     /// The reply to `info`, encoded.
     pub info: Vec<u8>,
-    /// Telemetry that was sent.
+    /// Telemetry that was sent before.
     pub replay_buffer: Arc<Mutex<ReplayBuffer>>,
     /// Counts queries that cannot be decoded.
     pub shared: Arc<SharedState>,

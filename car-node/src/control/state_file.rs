@@ -14,15 +14,15 @@ pub enum StateFileError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
-    /// It does not hold what it should.
+    /// Its content is not a valid state.
     #[error("{path}: {source}; move it away to start again without it")]
     Content {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: serde_json::Error,
     },
 }

@@ -1,11 +1,11 @@
-//! What other threads may ask of the filter.
+//! Commands from other threads to the filter.
 
 use crossbeam_channel::Sender;
 use maps::Pose;
 use protocol::SetRef;
 use synpf::{Hypothesis, Localizer, PreparedParameters};
 
-/// How a parameter set is put in force. Everything that takes time was done before, in another thread.
+/// The way in which a parameter set is put in force. Another thread has already done everything that takes time.
 #[derive(Debug)]
 pub enum LocalizerChange {
     /// The localizer takes the set and keeps its state.
@@ -38,7 +38,7 @@ pub enum FilterCommand {
         /// Receives the update.
         reply: Sender<u64>,
     },
-    /// List what a search has found so far, best first.
+    /// List the candidates that a search has found so far, best first.
     Candidates {
         /// Receives the candidates.
         reply: Sender<Vec<Hypothesis>>,

@@ -34,7 +34,7 @@ pub struct FilterConfig {
     pub localizer: Box<dyn Localizer>,
     /// The map that it localizes on.
     pub map: Arc<TrackMap>,
-    /// Judges every update.
+    /// Sets the health state after every update.
     pub monitor: Monitor,
     /// Pose of the laser on the car.
     pub base_link_from_laser: Pose,
@@ -54,7 +54,7 @@ pub struct FilterConfig {
     pub ros: Option<RosSink>,
 }
 
-/// One pace for each topic with a rate of its own.
+/// One pace for each topic that has its own rate.
 #[derive(Debug, Default)]
 struct Paces {
     pose: Pace,
@@ -166,7 +166,7 @@ impl FilterWorker {
             .event(self.now(), self.update_number(), kind, Some(by), None);
     }
 
-    /// The rates that are wanted, lowered by the throttle.
+    /// The configured rates, lowered by the throttle.
     fn rates(&self) -> Rates {
         let shared = &self.config.shared;
         let wanted = *shared.rates.lock().unwrap_or_else(PoisonError::into_inner);
@@ -252,7 +252,7 @@ impl FilterWorker {
         self.laps.on_new_pose();
     }
 
-    /// The pose now of a candidate: as it was listed, moved by the odometry since.
+    /// The current pose of a candidate: the listed pose, moved by the odometry since then.
     fn listed_candidate(&self, number: usize) -> Result<Pose, String> {
         let Listed { candidates, odometry } = &self.listed;
         let candidate = number
@@ -530,7 +530,7 @@ impl FilterWorker {
         }
     }
 
-    /// An event for each thing wrong with a sensor, the first time that it is a cause.
+    /// Sends an event for each fault of a sensor, the first time that it is a cause.
     fn announce_findings(&mut self) {
         let causes = &self.config.monitor.verdict().causes;
         let new: Vec<Cause> = causes

@@ -32,7 +32,7 @@ impl LapCounter {
         self.begun
     }
 
-    /// The localizer got a new pose: the step to it is no motion.
+    /// The localizer got a new pose: the step to it does not count as motion.
     pub fn on_new_pose(&mut self) {
         self.last = None;
     }

@@ -34,10 +34,10 @@ const REFERENCE: &str = "reference";
 /// The kind that follows another localizer, and its set.
 pub const EXTERNAL: &str = "external";
 
-/// A key that only sets of the reference had when it was a mode of SynPF.
+/// A key from the time when the reference was a mode of SynPF. Only sets for that mode had it.
 const FORMER_KEY: &str = "defect_update_per_odometry";
 
-/// What the reference's parameters were called then.
+/// Names of the reference's parameters at that time, and today.
 const FORMER_NAMES: [(&str, &str); 4] = [
     ("beams", "des_lidar_beams"),
     ("initial_std_x", "initial_var_x"),
@@ -97,7 +97,7 @@ impl LocalizerParameters {
         }
     }
 
-    /// This set, or the default of the kind that a value of [`KIND_KEY`] names, if it is another.
+    /// This set, or the default of the kind that a value of [`KIND_KEY`] names if that is another kind.
     pub fn of_kind(&self, kind: Option<&Value>) -> Result<Self, ParameterFault> {
         Ok(match kind {
             None => self.clone(),
@@ -234,8 +234,8 @@ impl From<LocalizerParameters> for ParameterValues {
     }
 }
 
-/// Reads a set that was kept: keys that are gone are left out, keys that are new get their default. A set that was kept when
-/// the reference was a mode of SynPF, with that mode on, is one for the reference emulation.
+/// Reads a stored set. Keys that no longer exist are left out; new keys get their default. A set stored with the former
+/// reference mode on is read as a set for the reference emulation.
 impl TryFrom<ParameterValues> for LocalizerParameters {
     type Error = String;
 
@@ -327,7 +327,7 @@ mod tests {
         };
         assert_eq!(set.des_lidar_beams, 31);
         assert!((set.initial_var_theta - 0.2).abs() < 1e-12);
-        // With the mode off it was one for SynPF.
+        // With the mode off it was a set for SynPF.
         let off: ParameterValues = given(&[(FORMER_KEY, false.into()), ("beams", 31.into())])
             .into_iter()
             .collect();

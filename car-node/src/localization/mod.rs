@@ -1,4 +1,4 @@
-//! The localizer at work: the thread that owns it, the shadow set beside it, and laps.
+//! The thread that owns the localizer, the shadow set, and the lap counter.
 
 mod external;
 pub mod filter_command;

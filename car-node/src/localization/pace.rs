@@ -2,7 +2,7 @@
 
 use synpf::Stamp;
 
-/// Lets something happen at a given rate at most.
+/// Limits something to a given rate.
 #[derive(Debug, Default)]
 pub(super) struct Pace {
     next: Option<Stamp>,
@@ -22,7 +22,7 @@ impl Pace {
             return false;
         }
         let next = self.next.unwrap_or(now).plus(period);
-        // After a pause the pace starts again; it does not catch up.
+        // After a pause the pace starts again, without extra events for the pause.
         self.next = Some(if next <= now { now.plus(period) } else { next });
         true
     }
@@ -45,7 +45,10 @@ mod tests {
         assert_eq!(due, 100);
         assert!(!pace.due(Stamp(0).plus(100.0), 0.0), "a rate of 0 is never due");
         assert!(pace.due(Stamp(0).plus(100.0), 10.0), "due again after a pause");
-        assert!(!pace.due(Stamp(0).plus(100.01), 10.0), "without catching up");
+        assert!(
+            !pace.due(Stamp(0).plus(100.01), 10.0),
+            "no extra event for the pause"
+        );
         assert!(
             pace.due(Stamp(0).plus(50.0), 10.0),
             "due when the clock was set back"

@@ -1,4 +1,4 @@
-//! From the filter to the shadow set: sensor data and updates, without ever blocking the filter.
+//! Passes sensor data and updates from the filter to the shadow set. It never blocks the filter.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};

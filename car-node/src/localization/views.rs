@@ -1,4 +1,4 @@
-//! What the pit wall draws of an update: particles, and the scan's end points on the map.
+//! The parts of an update that the pit wall draws: particles, and the scan's end points on the map.
 
 use maps::Pose;
 use synpf::{Scan, TrackMap, Update, WeightedPose};

@@ -1,5 +1,5 @@
-//! Executes commands: decodes, refuses or executes each one, publishes events and answers. It names no network: bytes come
-//! in, bytes go out.
+//! Executes commands: decodes each one, refuses or executes it, publishes events, and answers. It takes and returns bytes
+//! and does not use the network.
 
 mod command_limit;
 mod parameters;
@@ -30,9 +30,9 @@ use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::shared_state::SharedState;
 use crate::wire;
 
-/// The filter takes commands between two messages; if it takes longer than this, it hangs.
+/// Longest wait for the filter. It takes commands between two messages; after this time it counts as hanging.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// How long the answer to a search waits for candidates.
+/// Time that the answer to a search waits for candidates.
 pub const SEARCH_PATIENCE: Duration = Duration::from_secs(1);
 
 /// Everything that the command handler owns from its start.
@@ -340,7 +340,7 @@ impl CommandHandler {
             .event(self.config.clock.now(), self.update, kind, who, command);
     }
 
-    /// Saves the persisted state. A failure is an event only: a full disk is no reason to refuse what already happened.
+    /// Saves the persisted state. A failure is reported as an event, because the change is already in force.
     fn save(&self) {
         if let Err(faults) = self.write_state() {
             let text = faults.join("; ");

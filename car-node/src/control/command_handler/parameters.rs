@@ -186,7 +186,7 @@ impl CommandHandler {
         true
     }
 
-    /// A shadow of the set that is now in force has nothing to compare.
+    /// Ends a shadow of the set that is now in force, because there is nothing to compare.
     fn end_shadow_of_set_in_force(&self, who: &str, command: Option<CommandId>) {
         let shadow = self
             .config
@@ -226,7 +226,7 @@ impl CommandHandler {
     /// Switches to the proposed set, if the car may switch by itself.
     pub(super) fn follow_proposal(&mut self) {
         let resting = self.auto_rests_until.is_some_and(|until| Instant::now() < until);
-        // A pending trial is an operator's experiment; it is left alone.
+        // A pending trial belongs to an operator; the car does not switch during it.
         if resting || self.config.store.reverts_at().is_some() {
             return;
         }

@@ -66,7 +66,8 @@ impl CommandHandler {
         }
     }
 
-    /// What the search finds within the search patience. Empty when it finds nothing by then, or a clear winner at once.
+    /// The candidates that the search finds within the search patience. Empty if there are none by then, or if one
+    /// candidate has won at once.
     fn candidates(&self) -> Vec<Candidate> {
         let until = Instant::now() + self.config.search_patience;
         while Instant::now() < until {

@@ -75,7 +75,7 @@ impl Budget {
 mod tests {
     use super::*;
 
-    /// Ten seconds at 40 scans a second; when the shadow ends, and why.
+    /// Runs ten seconds at 40 scans a second. Returns when the shadow ends, and the reason.
     fn drive(change: impl Fn(usize, &mut ScanCost)) -> Option<(f64, String)> {
         let mut budget = Budget::default();
         (0..400).find_map(|scan| {
@@ -94,7 +94,7 @@ mod tests {
     #[test]
     fn a_car_with_time_to_spare_keeps_its_shadow() {
         assert_eq!(drive(|_, _| ()), None);
-        // A hiccup every second is none.
+        // One slow scan every second does not end it.
         let hiccup = drive(|scan, spent| {
             if scan % 40 < 3 {
                 (spent.taken, spent.queued, spent.skipped) = (0.03, 20, 1);

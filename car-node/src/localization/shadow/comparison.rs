@@ -1,4 +1,4 @@
-//! Two sets over the same scans, in numbers.
+//! Compares two sets over the same scans.
 
 use std::collections::VecDeque;
 
@@ -9,10 +9,10 @@ use synpf::{Stamp, Update};
 use crate::telemetry::counters::Spread;
 use crate::wire;
 
-/// The last seconds are compared, about a lap of a small track \[s\].
+/// Length of the window that is compared \[s\]: about a lap of a small track.
 const LENGTH: f64 = 10.0;
 
-/// What one set made of a scan.
+/// The results of one set for a scan.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ScanOutcome {
     stamp: Stamp,
@@ -43,7 +43,7 @@ impl ScanOutcome {
 #[derive(Debug, Default)]
 pub(super) struct ComparisonWindow {
     set: Option<SetRef>,
-    /// Of the set in force, and of the shadow set.
+    /// The results of the set in force, and those of the shadow set.
     scans: VecDeque<[ScanOutcome; 2]>,
     skipped: VecDeque<(Stamp, u64)>,
 }
@@ -110,7 +110,7 @@ impl ComparisonWindow {
     }
 }
 
-/// Of the set in force (0) or the one in the shadow (1).
+/// The results of the set in force (0) or of the shadow set (1).
 fn fitness(scans: &VecDeque<[ScanOutcome; 2]>, which: usize) -> Fitness {
     let count = scans.len().max(1) as f64;
     let mean = |of: fn(&ScanOutcome) -> f64| scans.iter().map(|pair| of(&pair[which])).sum::<f64>() / count;

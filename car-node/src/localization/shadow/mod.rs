@@ -1,5 +1,5 @@
-//! A second localizer under another parameter set, on its own thread, over the data that the filter has accepted. An
-//! operator can then decide on a switch by evidence.
+//! Runs a second localizer under another parameter set, on its own thread, over the data that the filter has accepted.
+//! An operator sees the comparison before switching.
 //!
 //! ```text
 //! filter --scan, odometry, its own update (never blocks)--> shadow --1 Hz--> comparison
@@ -28,7 +28,7 @@ use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::queue::Record;
 use crate::telemetry::shared_state::SharedState;
 
-/// What the command handler asks of the shadow.
+/// Commands from the command handler to the shadow.
 #[derive(Debug)]
 pub enum ShadowCommand {
     /// Run this set.
@@ -49,7 +49,7 @@ pub enum ShadowCommand {
 
 /// The comparison is published this often.
 const PERIOD: Duration = Duration::from_secs(1);
-/// A localizer that has just got its pose is not compared yet \[s\].
+/// A localizer is compared from this time after it got its pose \[s\].
 const SETTLING: f64 = 2.0;
 
 /// Starts the thread. It ends when `commands` has no sender left.
@@ -109,7 +109,7 @@ impl ShadowWorker {
                 },
                 recv(inputs) -> input => match input {
                     Ok(input) => self.handle(input),
-                    // The filter is gone; only the end is left to wait for.
+                    // The filter has ended; wait for the end of the commands.
                     Err(_) => inputs = crossbeam_channel::never(),
                 },
                 default(patience) => {}
@@ -181,7 +181,7 @@ impl ShadowWorker {
         }
     }
 
-    /// Ends the shadow for the car's own reasons.
+    /// Ends the shadow for a reason that the car has found itself.
     fn drop_shadow(&mut self, evidence: String) {
         let Some(running) = self.running.take() else {
             return;

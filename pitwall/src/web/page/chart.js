@@ -35,7 +35,7 @@ export function plot(canvas, points, now, { value, low, high, limits = [] }) {
   for (const point of points) {
     const v = value(point);
     if (v === null || v === undefined) { before = null; continue; }
-    // A pause is no line.
+    // The line is interrupted during a pause.
     if (before && point.at - before.at < 2.5) {
       const next = colours[(STATES[point.state] ?? STATES.INIT)[1]];
       if (next !== colour) {

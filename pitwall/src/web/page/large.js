@@ -1,4 +1,4 @@
-// One car over the whole middle of the page: all causes, big numbers, two minutes of history, every set.
+// The large view of one car in the middle of the page: all causes, figures, two minutes of history, every set.
 
 import { plot } from "/chart.js";
 import { FACTS, STATES, recorderText, colourOf, element, fixed, lasting, setText, verdict } from "/cards.js";

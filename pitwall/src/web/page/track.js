@@ -2,9 +2,9 @@
 
 import { STATES, colourOf, fixed } from "/cards.js";
 
-/// Length of a trail [s]; of those not selected, where there are many.
+/// Length of a trail [s]: of the selected car, and of the others if there are many.
 const TRAIL_S = 12, SHORT_TRAIL_S = 3, MANY = 6;
-/// What is shown around the raceline, so that the walls are seen [m].
+/// Margin around the raceline, so that the walls are in view [m].
 const MARGIN = 2.4;
 const END_POINTS = ["good", "quiet", "warn", "bad"];
 
@@ -22,10 +22,10 @@ export function palette() {
   return colours;
 }
 
-/// Width of a bad stretch relative to a good one, so that it is visible without colours.
+/// Width of a bad stretch relative to a good one, for readers who do not see the colours.
 const WIDTHS = { good: 1, busy: 1.6, warn: 1.8, bad: 2.8 };
 
-/// What can be painted along the track: name, colour of a place, legend.
+/// The quantities that can be painted along the track: name, colour of a place, legend.
 const PAINTS = {
   off: null,
   state: [(p) => (STATES[p.state.toUpperCase()] ?? STATES.INIT)[1], [["good", "localized"], ["warn", "degraded"], ["bad", "lost, stale"], ["busy", "searching"]]],
@@ -62,7 +62,7 @@ export class Track {
     }, { passive: false });
   }
 
-  /// Takes in a snapshot; draws at the browser's next frame.
+  /// Stores a snapshot, and draws it at the browser's next frame.
   update(snapshot, selected) {
     this.snapshot = snapshot;
     this.selected = selected;
@@ -88,14 +88,14 @@ export class Track {
     }
   }
 
-  /// Another epoch: what was known is void, but for the maps.
+  /// A new epoch has begun: forgets everything but the maps.
   restart() {
     this.trails.clear();
     this.profiles.clear();
     this.candidates = [];
   }
 
-  /// Paints something else along the track; returns its name and legend.
+  /// Paints the next quantity along the track; returns its name and legend.
   paintNext() {
     const names = Object.keys(PAINTS);
     this.paint = names[(names.indexOf(this.paint) + 1) % names.length];
@@ -109,7 +109,7 @@ export class Track {
     if (response.ok) this.maps.set(car, await response.json());
   }
 
-  /// The map shown: the selected car's, else the first there is.
+  /// The map that is shown: that of the selected car, or else the first one.
   map() { return this.maps.get(this.selected) ?? this.maps.values().next().value; }
 
   /// Draws the grid once for each theme.
@@ -127,7 +127,7 @@ export class Track {
     for (const [cell, length] of map.runs) {
       const [r, g, b] = colours[cell];
       for (let i = 0; i < length; i++, at++) {
-        // The grid's first row is its lowest, the image's its highest.
+        // The grid's first row is its lowest one; that of the image is its highest.
         const row = map.height - 1 - Math.floor(at / map.width);
         pixels.data.set([r, g, b, 255], 4 * (row * map.width + at % map.width));
       }
@@ -151,7 +151,7 @@ export class Track {
     }
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
     const [left, right, low, high] = [Math.min(...xs) - MARGIN, Math.max(...xs) + MARGIN, Math.min(...ys) - MARGIN, Math.max(...ys) + MARGIN];
-    // The tools take the lowest part.
+    // The tools cover the lowest part.
     const tools = 48;
     const scale = Math.min(width / (right - left), (height - tools) / (high - low));
     this.view = { x: (left + right) / 2, y: (low + high) / 2 - tools / 2 / scale, scale };
@@ -229,7 +229,7 @@ export class Track {
     context.fillStyle = colour.unknown;
     context.fillRect(0, 0, width, height);
     const map = this.map();
-    // Until somebody zooms or pans, the whole track stays in view, also when the window changes.
+    // The whole track stays in view until somebody zooms or pans, also when the window changes its size.
     if (this.size !== `${width} ${height}`) {
       this.size = `${width} ${height}`;
       if (!this.handled) this.fitted = false;
@@ -243,7 +243,7 @@ export class Track {
     if (this.follow && followed) this.handled = true;
     if (this.follow && followed) Object.assign(this.view, { x: followed.x_m, y: followed.y_m });
 
-    // From here on in metres of `map`, y up.
+    // Coordinates from here on are those of `map` [m], with y up.
     const { scale } = this.view;
     const [ox, oy] = this.toCanvas(0, 0);
     context.setTransform(ratio * scale, 0, 0, -ratio * scale, ratio * ox, ratio * oy);
@@ -254,7 +254,7 @@ export class Track {
     const selected = this.snapshot.selected;
     if (selected && selected.car === this.selected) this.drawSelected(context, selected, pixel, colour);
     this.snapshot.cars.forEach((car, i) => this.drawCar(context, car, i, pixel, colour));
-    // The best last, and so on top.
+    // The best is drawn last, so that it is on top.
     for (const candidate of [...this.candidates].reverse()) this.drawCandidate(context, candidate, pixel, colour);
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.drawNames(context, colour);
@@ -282,7 +282,7 @@ export class Track {
     }
   }
 
-  /// The selected car's lap, place by place, as it was the last time it was there.
+  /// The latest values of the selected car at each place of the lap.
   drawStrip(context, map, pixel, colour) {
     const profile = this.profiles.get(this.selected);
     const line = map.raceline?.points ?? [];
@@ -306,7 +306,7 @@ export class Track {
     context.globalAlpha = 1;
   }
 
-  /// Where the car has been, in the colours of its state then: old parts fainter, in a few steps.
+  /// The car's trail, in the colours of its state at the time. Older parts are fainter, in a few steps.
   drawTrail(context, car, pixel, colour) {
     const trail = this.trails.get(car.car) ?? [];
     const now = this.snapshot.now / 1e9;
@@ -364,7 +364,7 @@ export class Track {
     context.save();
     context.translate(x, y);
     context.rotate(heading);
-    // As large as the car is, but never too small to be seen. base_link is the rear axle.
+    // As large as the car, but large enough to be visible. base_link is the rear axle.
     const size = Math.max(1, 18 * pixel / 0.5);
     context.scale(size, size);
     context.beginPath();

@@ -10,6 +10,7 @@ use car_node::network::endpoint;
 use car_node::recording::RecordOptions;
 use car_node::sensors::Ros2Options;
 use car_node::sensors::frames::Mount;
+use car_node::stress::{Defect, DefectChoice, DefectKind};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use maps::Pose;
 use protocol::CarName;
@@ -40,6 +41,11 @@ pub(crate) enum Command {
     ///
     /// First each improvement on top of the ones before, then the whole set without each of them.
     Ablate(Ablate),
+    /// Damage a recorded drive in many ways, and report where a parameter set holds and where it does not.
+    ///
+    /// Defects of the map, of what stands around the car, of every sensor and of the clock, mostly in three grades. With
+    /// true poses in the bag, errors are against them; without, against the set's own undamaged run. Uses all cores.
+    Stress(Stress),
     /// Race simulated cars that drive on the localizer's estimates, and compare the laps with the paper's.
     ///
     /// The same seed gives the same race; only the load differs from run to run. Exit code: 0 when every car drove all laps
@@ -362,6 +368,34 @@ pub(crate) struct Ablate {
     pub(crate) json: bool,
 }
 
+/// Arguments of `stress`.
+#[derive(Debug, Args)]
+#[command(after_long_help = catalogue())]
+pub(crate) struct Stress {
+    /// What to run over.
+    #[command(flatten)]
+    pub(crate) inputs: Bags,
+    /// Parameter sets: hq, lq, adaptive, synpf-baseline, or YAML files; may be repeated, or a list.
+    #[arg(long, value_name = "NAME|FILE", value_delimiter = ',', num_args = 1.., default_value = "hq")]
+    pub(crate) params: Vec<String>,
+    /// Pose of base_link in the map at the first scan [m, m, rad], for a bag without truth; without it the localizer searches
+    /// the map.
+    #[arg(long, value_name = "X,Y,HEADING", value_parser = start, allow_hyphen_values = true)]
+    pub(crate) initial_pose: Option<Start>,
+    /// Seeds of the filter's random numbers and of the defects; may be repeated, or a list: 0,1,2.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "0", allow_negative_numbers = true, value_parser = seed)]
+    pub(crate) seed: Vec<u64>,
+    /// Only these defects, as a list: people,range-noise:severe [default: all].
+    #[arg(long, value_name = "KIND[:GRADE]", value_delimiter = ',')]
+    pub(crate) only: Vec<DefectChoice>,
+    /// Write a page with plots to this file.
+    #[arg(long, value_name = "OUT.html")]
+    pub(crate) html: Option<PathBuf>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
 /// Arguments of `race`.
 #[derive(Debug, Args)]
 pub(crate) struct Race {
@@ -396,8 +430,13 @@ pub(crate) struct Race {
     /// Speed over the raceline's own, 0.1 to 2.
     #[arg(long, value_name = "FACTOR", default_value = "1.0", allow_negative_numbers = true, value_parser = speed)]
     pub(crate) speed: f64,
+    /// Damage sensors and map by these defects, each medium unless a grade is given: people,range-noise:severe. Names are
+    /// those in stress --help; kidnap, bent-map and scaled-map are for logs only. The driver's speed control has sensors of
+    /// its own.
+    #[arg(long, value_name = "KIND[:GRADE]", value_delimiter = ',')]
+    pub(crate) faults: Vec<DefectChoice>,
     /// Run the paper's grid (every localizer on both tyres) and print it beside table I of the paper.
-    #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars"])]
+    #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars", "faults"])]
     pub(crate) table: bool,
     /// One JSON object on stdout; an array of rows with --table.
     #[arg(long)]
@@ -527,6 +566,30 @@ pub(crate) struct TrackArguments {
     pub(crate) raceline: Option<PathBuf>,
 }
 
+/// The defects, as the help of `stress` lists them.
+fn catalogue() -> String {
+    let mut text = "Defects, with the sizes of their grades mild, medium and severe:\n".to_owned();
+    let mut part = None;
+    for kind in DefectKind::ALL {
+        if part != Some(kind.part()) {
+            part = Some(kind.part());
+            text += &format!("{}\n", kind.part());
+        }
+        let sizes: Vec<_> = kind
+            .grades()
+            .map(Defect::size_text)
+            .filter(|size| !size.is_empty())
+            .collect();
+        let mut line = format!("  {:<18} {}", kind.name(), kind.text());
+        if !sizes.is_empty() {
+            line += &format!(" ({})", sizes.join(" | "));
+        }
+        text += &line;
+        text.push('\n');
+    }
+    text
+}
+
 /// Parses a number within a range. The error names the range.
 fn within(text: &str, least: f64, most: f64) -> Result<f64, String> {
     match text.parse::<f64>() {
@@ -652,6 +715,7 @@ mod tests {
             (&format!("evaluate {bags} --seed -1"), "--seed"),
             (&format!("evaluate {bags} --seed 0,-1"), "--seed"),
             (&format!("ablate {bags} --seed -1"), "--seed"),
+            (&format!("stress {bags} --seed -1"), "--seed"),
             ("track new folder --length -1", "--length"),
             ("track new folder --width -1", "--width"),
             ("track new folder --seed -1", "--seed"),

@@ -7,7 +7,8 @@
 //! ```
 //!
 //! The library holds the parts, the binary the commands. The filter's thread never waits for the network, a disk or a clock.
-//! [`evaluate`] runs a localizer over a recorded log and [`race`] drives simulated cars; neither needs a network.
+//! [`evaluate`] runs a localizer over a recorded log, [`stress`] over a log that is damaged in many ways, and [`race`] drives
+//! simulated cars; none needs a network.
 //!
 //! A lap of the bundled track `club`, driven on the localizer's own estimates:
 //!
@@ -29,6 +30,7 @@
 //!     pose_source: PoseSource::Localizer(LocalizerParameters::named("hq").ok_or("a built-in set")?),
 //!     speed_scale: 1.0,
 //!     seed: 0,
+//!     defects: Vec::new(),
 //! };
 //! let cars = race(&track, &map, &setup)?;
 //! assert!(cars[0].finished && cars[0].crashes == 0);
@@ -48,5 +50,6 @@ pub mod recording;
 pub mod ros2;
 pub mod sensors;
 pub mod statistics;
+pub mod stress;
 pub mod telemetry;
 pub mod wire;

@@ -26,6 +26,7 @@ fn main() -> ExitCode {
         Command::Run(arguments) => commands::run::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Evaluate(arguments) => commands::evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Ablate(arguments) => commands::ablate::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::Stress(arguments) => commands::stress::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Race(arguments) => commands::race::run(&arguments),
         Command::Import(arguments) => commands::import::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),

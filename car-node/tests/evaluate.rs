@@ -1,4 +1,4 @@
-//! `car-node evaluate` as a user calls it, on a bag and a map written here.
+//! `car-node evaluate` and `car-node stress` as a user calls them, on a bag and a map written here.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -101,11 +101,16 @@ fn header(stamp: Stamp, frame: &str) -> Header {
 /// Four seconds: 40 Hz scans that arrive 20 ms late, 50 Hz odometry, truth, and the mount; another scanner and
 /// another odometry beside them.
 fn write_bag(folder: &Path) -> PathBuf {
+    write_bag_with_truth(folder, "/ground_truth/odom")
+}
+
+/// The same, with the truth under another topic.
+fn write_bag_with_truth(folder: &Path, truth_topic: &str) -> PathBuf {
     let path = folder.join("drive.mcap");
     let mut bag = BagWriter::create(&path);
     let scan = bag.channel("/scan", "sensor_msgs/msg/LaserScan");
     let odometry = bag.channel("/vesc/odom", "nav_msgs/msg/Odometry");
-    let truth = bag.channel("/ground_truth/odom", "nav_msgs/msg/Odometry");
+    let truth = bag.channel(truth_topic, "nav_msgs/msg/Odometry");
     let tf = bag.channel("/tf_static", "tf2_msgs/msg/TFMessage");
     let chatter = bag.channel("/chatter", "std_msgs/msg/String");
     let start = Stamp(1_700_000_000_000_000_000);
@@ -172,8 +177,12 @@ fn write_bag(folder: &Path) -> PathBuf {
 }
 
 fn evaluate(map: &Path, bag: &Path, more: &[&str]) -> Output {
+    car_node("evaluate", map, bag, more)
+}
+
+fn car_node(command: &str, map: &Path, bag: &Path, more: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_car-node"))
-        .arg("evaluate")
+        .arg(command)
         .arg("--map")
         .arg(map)
         .arg("--bag")
@@ -398,4 +407,94 @@ fn faults_are_named_with_their_file() {
         &["--poses", "one --seed"],
     );
     fails(2, &map, &bag, &["--laser", "270,0,0"], &["--laser", "10 m"]);
+}
+
+#[test]
+fn a_drive_is_damaged_and_the_report_says_where_the_set_holds() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    let page = folder.path().join("stress.html");
+    let only =
+        "wall-missing:mild,range-noise:mild,dropout:mild,late-stamps:mild,twist-zero,gyro-none,kidnap:mild";
+    let html = page.to_str().expect("UTF-8");
+    let run = || car_node("stress", &map, &bag, &["--only", only, "--json", "--html", html]);
+    let output = run();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
+    let set = &report["sets"][0];
+    assert_eq!((&set["set"], &set["truth"]), (&"hq".into(), &"bag".into()));
+    let rows = set["rows"].as_array().expect("rows");
+    let names: Vec<_> = rows
+        .iter()
+        .map(|row| row["defect"].as_str().expect("a name"))
+        .collect();
+    // In the order of the catalogue.
+    let expected = [
+        "wall-missing",
+        "range-noise",
+        "dropout",
+        "twist-zero",
+        "gyro-none",
+        "late-stamps",
+        "kidnap",
+    ];
+    assert_eq!(names, expected);
+    for row in rows {
+        let defect = row["defect"].as_str();
+        match (defect, row["not_applicable"].as_str()) {
+            (Some("gyro-none"), reason) => assert_eq!(reason, Some("the log has no gyroscope")),
+            (Some("kidnap"), reason) => assert_eq!(reason, Some("the log is too short: it needs 17 s")),
+            (_, reason) => {
+                assert_eq!(reason, None, "{row}");
+                // In a small room, these do little.
+                assert!(row["max_m"].as_f64().expect("updates") < 0.15, "{row}");
+            }
+        }
+    }
+    assert!(
+        fs::read_to_string(&page)
+            .expect("written")
+            .contains("does not apply")
+    );
+    assert_eq!(run().stdout, output.stdout, "the same seed, the same report");
+}
+
+#[test]
+fn a_bag_without_truth_is_compared_with_its_undamaged_run() {
+    let folder = tempfile::tempdir().expect("folder");
+    let map = write_map(folder.path());
+    let bag = write_bag_with_truth(folder.path(), "/mocap");
+    let more = ["--initial-pose", "3.0,2.0,1.571", "--only", "range-noise:mild"];
+    let output = car_node("stress", &map, &bag, &more);
+    let table = String::from_utf8_lossy(&output.stdout);
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
+    assert!(table.contains("the set's own undamaged run"), "{table}");
+    assert!(table.contains("undamaged: position RMSE 0.0 cm"), "{table}");
+    // In a pipe there are no colours.
+    assert!(
+        table.contains("range-noise") && !table.contains('\u{1b}'),
+        "{table}"
+    );
+}
+
+#[test]
+fn wrong_calls_of_stress_are_refused_with_the_reason() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (map, bag) = (write_map(folder.path()), write_bag(folder.path()));
+    for (more, words) in [
+        (&["--only", "flood"][..], "no defect"),
+        (&["--only", "people:awful"], "mild, medium, severe"),
+        (&["--params", "no-such-set"], "no-such-set"),
+        (&["--initial-pose", "here"], "--initial-pose"),
+    ] {
+        let output = car_node("stress", &map, &bag, more);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains(words), "{said}");
+    }
 }

@@ -18,6 +18,7 @@ pub(crate) mod import;
 pub(crate) mod placement;
 pub(crate) mod race;
 pub(crate) mod run;
+pub(crate) mod stress;
 pub(crate) mod track;
 
 use std::io::{ErrorKind, Write};

@@ -4,17 +4,20 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use car_node::localization::LocalizerParameters;
-use car_node::race::{CarResult, PAPER_ROWS, PoseSource, Quality, RaceSetup, RaceSummary, SPEED_SCALE, race};
+use car_node::race::{
+    CarResult, PAPER_ROWS, PoseSource, Quality, RaceSetup, RaceSummary, SPEED_SCALE, applies_to_races, race,
+};
 use car_node::statistics::MeanSigma;
+use car_node::stress::Defect;
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
 use simulator::{Track, TrackReport};
 use synpf::TrackMap;
 
-use super::{find_track, load_set};
+use super::{BadUsage, find_track, load_set};
 use crate::cli;
 
 /// The races of one localizer on one tyre, as reported.
@@ -25,6 +28,9 @@ struct Report {
     odometry: Quality,
     laps_each: u32,
     seeds: Vec<u64>,
+    /// The defects of `--faults`, as `KIND:GRADE`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    faults: Vec<String>,
     summary: RaceSummary,
     /// By seed, then by car; not in tables.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -63,6 +69,19 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
     } else {
         ExitCode::from(UNFINISHED)
     })
+}
+
+/// The defects of `--faults`.
+fn faults(arguments: &cli::Race) -> anyhow::Result<Vec<Defect>> {
+    let defects: Vec<Defect> = arguments.faults.iter().map(|choice| choice.one()).collect();
+    match defects.iter().find(|defect| !applies_to_races(defect.kind)) {
+        None => Ok(defects),
+        Some(defect) => {
+            let text =
+                format!("--faults {defect}: this defect needs a recorded drive; car-node stress has it");
+            bail!(BadUsage(text));
+        }
+    }
 }
 
 /// The pose source that the arguments ask for, with its title.
@@ -110,6 +129,7 @@ fn races(
         pose_source,
         speed_scale: arguments.speed,
         seed: 0,
+        defects: faults(arguments)?,
     };
     let progress = progress_bar(seeds.len() as u64, &localizer, quality);
     let races = seeds
@@ -135,6 +155,7 @@ fn races(
         odometry: quality,
         laps_each: arguments.laps,
         seeds,
+        faults: setup.defects.iter().map(ToString::to_string).collect(),
         summary: RaceSummary::of(&cars),
         races,
     })
@@ -288,6 +309,9 @@ fn print_one(report: &Report) {
         s.finished,
         s.started
     );
+    if !report.faults.is_empty() {
+        say!("  with {}", report.faults.join(", "));
+    }
     let line = |name: &str, value: String, unit: &str| say!("  {name:<22} {value:>17}  {unit}");
     line("lap time", mean_sigma(s.lap_time_s, 1.0, 3), "s");
     line(

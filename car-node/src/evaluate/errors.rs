@@ -7,7 +7,7 @@ use synpf::Stamp;
 use crate::statistics::ErrorSummary;
 
 /// Errors in the first seconds are those of the start, and do not count \[s\].
-pub(super) const SETTLING: f64 = 2.0;
+pub(crate) const SETTLING: f64 = 2.0;
 /// A position error above this is an excursion \[m\].
 const EXCURSION_DISTANCE: f64 = 1.0;
 /// An excursion counts when it lasts this long \[s\].

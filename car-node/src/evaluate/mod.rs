@@ -16,6 +16,7 @@ use serde::Serialize;
 use synpf::{Dropped, Localizer, PoseError, Stamp, Update};
 
 pub use consistency::{Consistency, Nees};
+pub(crate) use errors::SETTLING;
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
 pub use pose_file::{PoseFileError, read_poses};

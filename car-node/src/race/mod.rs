@@ -12,6 +12,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use maps::{Pose, wrap_angle};
+use rand::SeedableRng;
+use rand::rngs::SmallRng;
 use serde::{Deserialize, Serialize};
 use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
 
@@ -23,7 +25,9 @@ pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSum
 
 use crate::health::{Monitor, Thresholds};
 use crate::localization::LocalizerParameters;
+use crate::sensors::bag::{Arrival, SensorEvent};
 use crate::sensors::{Script, ScriptedIncident};
+use crate::stress::{ArrivalQueue, DamageChain, DamagedArrival, Defect, DefectKind, map_damage};
 use results::CarMeasurements;
 
 /// Where a driver gets the car's pose from.
@@ -77,10 +81,43 @@ pub struct RaceSetup {
     pub speed_scale: f64,
     /// Seed of all random numbers.
     pub seed: u64,
+    /// Defects of every car's sensors and of the map that its localizer gets.
+    pub defects: Vec<Defect>,
 }
 
 /// Gap between two cars at the start, along the raceline \[m\].
 const GRID_GAP: f64 = 3.0;
+
+/// False for a defect that needs a recorded drive: a map that is moved as a whole, and a car that is carried.
+pub fn applies_to_races(kind: DefectKind) -> bool {
+    !matches!(
+        kind,
+        DefectKind::BentMap | DefectKind::ScaledMap | DefectKind::Kidnap
+    )
+}
+
+/// The map of the track with the defects that are those of maps; a defect that does not apply changes nothing.
+fn damaged_map(track: &Track, map: &Arc<TrackMap>, setup: &RaceSetup) -> Result<Arc<TrackMap>, SetUpError> {
+    let line = &track.raceline;
+    let steps = (line.length() / 0.1).ceil() as usize;
+    let path: Vec<Pose> = (0..steps)
+        .map(|step| line.at(step as f64 * line.length() / steps as f64))
+        .map(|point| Pose::new(point.x, point.y, point.heading))
+        .collect();
+    let mut random = SmallRng::seed_from_u64(setup.seed);
+    let mut grid = None;
+    for defect in setup
+        .defects
+        .iter()
+        .filter(|defect| applies_to_races(defect.kind))
+    {
+        let before = grid.as_ref().unwrap_or_else(|| map.grid());
+        if let Some((damaged, _)) = map_damage::damage(before, *defect, &path, &mut random) {
+            grid = Some(damaged);
+        }
+    }
+    grid.map_or_else(|| Ok(Arc::clone(map)), |grid| TrackMap::new(grid).map(Arc::new))
+}
 
 /// Runs a race until all laps are driven, or four times their expected time has passed. `map` is the track's map, prepared
 /// once for all races.
@@ -94,15 +131,32 @@ pub fn race(
         laps: Some(setup.laps),
         time: Duration::from_secs_f64(10.0 + 4.0 * expected),
     };
-    run(
+    let field = field(setup);
+    let map = damaged_map(track, map, setup)?;
+    let sensors = field.iter().map(|car| {
+        // Every simulated car has a gyroscope.
+        DamageChain::new(&setup.defects, car.lidar.base_link_from_laser, true, setup.seed)
+    });
+    drive(
         track,
-        map,
-        &field(setup),
-        Vec::new(),
+        &map,
+        &field,
+        Incidents {
+            script: Vec::new(),
+            sensors: sensors.collect(),
+        },
         &setup.pose_source,
         end,
         setup.seed,
     )
+}
+
+/// What goes wrong in a race.
+struct Incidents {
+    /// Incidents at set times.
+    script: Vec<ScriptedIncident>,
+    /// Defects of each car's sensors; cars without an entry have none.
+    sensors: Vec<DamageChain>,
 }
 
 /// When a race ends.
@@ -137,11 +191,33 @@ pub fn run(
     end: End,
     seed: u64,
 ) -> Result<Vec<CarResult>, SetUpError> {
+    let sensors = Vec::new();
+    drive(
+        track,
+        map,
+        setups,
+        Incidents { script, sensors },
+        pose_source,
+        end,
+        seed,
+    )
+}
+
+fn drive(
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    setups: &[CarSetup],
+    incidents: Incidents,
+    pose_source: &PoseSource,
+    end: End,
+    seed: u64,
+) -> Result<Vec<CarResult>, SetUpError> {
     let mut world = World::new(Arc::clone(track), setups, seed);
-    let mut script = Script::new(script);
+    let mut script = Script::new(incidents.script);
+    let mut sensors = incidents.sensors.into_iter();
     let mut runners = (0..)
         .zip(setups)
-        .map(|(index, car)| CarRunner::new(&world, index, map, pose_source, car, seed))
+        .map(|(index, car)| CarRunner::new(&world, index, map, pose_source, car, seed, sensors.next()))
         .collect::<Result<Vec<_>, _>>()?;
 
     let begin = Instant::now();
@@ -172,10 +248,16 @@ pub fn run(
 struct CarRunner {
     pose_source: ActivePoseSource,
     measurements: CarMeasurements,
+    /// Defects of its sensors, and the messages that they delay.
+    defects: Option<DamageChain>,
+    queue: ArrivalQueue,
     /// True poses of the last half second, for estimates of the past.
     truths: VecDeque<(Stamp, Pose)>,
     base_link_from_laser: Pose,
-    latest: Option<simulator::Odometry>,
+    /// The latest odometry that has reached the localizer.
+    latest: Option<Odometry>,
+    /// The speed \[m/s\] and the yaw rate [rad/s] that the driver gets. They come from sensors without defects.
+    speeds: [f64; 2],
 }
 
 enum ActivePoseSource {
@@ -193,6 +275,7 @@ impl CarRunner {
         pose_source: &PoseSource,
         car: &CarSetup,
         seed: u64,
+        defects: Option<DamageChain>,
     ) -> Result<Self, SetUpError> {
         let start = world.truth(index).pose;
         let base_link_from_laser = car.lidar.base_link_from_laser;
@@ -214,53 +297,81 @@ impl CarRunner {
         Ok(Self {
             pose_source,
             measurements: CarMeasurements::new(Arc::clone(world.track()), Arc::clone(map)),
+            defects,
+            queue: ArrivalQueue::default(),
             truths: VecDeque::new(),
             base_link_from_laser,
             latest: None,
+            speeds: [0.0; 2],
         })
     }
 
-    /// Gives a message to the localizer. Returns a new estimate, if there is one.
+    /// Gives a message to the localizer, and those that have arrived with it. Returns a new estimate, if there is one.
     fn handle(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
-        match message {
-            Message::Odometry(odometry) => {
+        let now = stamp(world.now());
+        if let Some(event) = sensor_event(message) {
+            if let SensorEvent::Odometry(odometry) = &event {
+                self.speeds = [odometry.twist.linear_x, odometry.twist.angular];
+            }
+            let arrival = Arrival { log_time: now, event };
+            match &mut self.defects {
+                Some(defects) => {
+                    let truths = &self.truths;
+                    defects.damage(arrival, &|time| true_pose(truths, time), &mut self.queue);
+                }
+                None => self.queue.push(DamagedArrival {
+                    measured: arrival.event.stamp(),
+                    arrival,
+                }),
+            }
+        }
+        let mut estimate = None;
+        while let Some(damaged) = self.queue.pop(now) {
+            estimate = self.receive(world, index, damaged).or(estimate);
+        }
+        self.note(world, index, message);
+        estimate
+    }
+
+    /// Gives a message of a sensor to the localizer.
+    fn receive(&mut self, world: &World, index: usize, damaged: DamagedArrival) -> Option<Estimate> {
+        let pose = match &damaged.arrival.event {
+            SensorEvent::Odometry(odometry) => {
                 self.latest = Some(*odometry);
                 let pose = self.on_odometry(odometry, world, index)?;
                 self.measurements.on_a_lap = world.on_a_lap(index);
                 self.measurements.driven(pose, world.truth(index).track.d);
-                Some(Estimate {
-                    time: odometry.stamp,
-                    pose,
-                    speed: odometry.speed,
-                    yaw_rate: odometry.yaw_rate,
-                })
+                pose
             }
-            Message::Gyro(gyro) => {
+            SensorEvent::YawRate(reading) => {
                 if let ActivePoseSource::Localizer(localizer, _) = &mut self.pose_source {
-                    let reading = YawRate {
-                        stamp: stamp(gyro.stamp),
-                        rate: gyro.yaw_rate,
-                    };
-                    self.measurements.timed(|| localizer.on_yaw_rate(&reading)).ok();
+                    self.measurements.timed(|| localizer.on_yaw_rate(reading)).ok();
                 }
-                None
+                return None;
             }
-            Message::Scan(scan) => {
-                let pose = self.on_scan(scan, stamp(world.now()))?;
-                let latest = self.latest?;
-                Some(Estimate {
-                    time: latest.stamp,
-                    pose,
-                    speed: latest.speed,
-                    yaw_rate: latest.yaw_rate,
-                })
-            }
+            SensorEvent::Scan(scan) => self.on_scan(scan, damaged.measured, stamp(world.now()))?,
+            // Simulated cars have no other localizer.
+            SensorEvent::Pose(_) => return None,
+        };
+        let latest = self.latest?;
+        let [speed, yaw_rate] = self.speeds;
+        Some(Estimate {
+            time: Duration::from_nanos(latest.stamp.0.max(0) as u64),
+            pose,
+            speed,
+            yaw_rate,
+        })
+    }
+
+    /// Records what is not for the localizer, and what happens to the car.
+    fn note(&mut self, world: &World, index: usize, message: &Message) {
+        match message {
+            Message::Odometry(_) | Message::Gyro(_) | Message::Scan(_) => {}
             Message::Truth(truth) => {
                 self.truths.push_back((stamp(truth.stamp), truth.pose));
                 if self.truths.len() > 50 {
                     self.truths.pop_front();
                 }
-                None
             }
             Message::Placed(pose) => {
                 // The localizer gets the pose at which the recovery crew put the car.
@@ -274,12 +385,8 @@ impl CarRunner {
                     }
                     ActivePoseSource::Truth => {}
                 }
-                None
             }
-            Message::Lap(lap) => {
-                self.measurements.lap(lap.time);
-                None
-            }
+            Message::Lap(lap) => self.measurements.lap(lap.time),
             Message::Crash(contact) => self.mishap(world, index, MishapKind::Crash, contact.impact),
             Message::Scrape(contact) => self.mishap(world, index, MishapKind::Scrape, contact.impact),
             Message::Collision(contact) => self.mishap(world, index, MishapKind::Collision, contact.impact),
@@ -287,8 +394,7 @@ impl CarRunner {
         }
     }
 
-    /// Records a mishap. Returns None, since it gives no estimate.
-    fn mishap(&mut self, world: &World, index: usize, kind: MishapKind, impact: f64) -> Option<Estimate> {
+    fn mishap(&mut self, world: &World, index: usize, kind: MishapKind, impact: f64) {
         let manoeuvre = world.manoeuvre(index);
         let [at, s, d] = {
             let truth = world.truth(index);
@@ -303,26 +409,16 @@ impl CarRunner {
             racing: manoeuvre == Manoeuvre::Racing,
             pose_error_m: None,
         });
-        None
     }
 
     /// `map_from_base_link` at the odometry's stamp.
-    fn on_odometry(&mut self, odometry: &simulator::Odometry, world: &World, index: usize) -> Option<Pose> {
+    fn on_odometry(&mut self, odometry: &Odometry, world: &World, index: usize) -> Option<Pose> {
         match &mut self.pose_source {
             ActivePoseSource::Localizer(localizer, monitor) => {
                 monitor.on_odometry(stamp(world.now()));
-                let message = Odometry {
-                    stamp: stamp(odometry.stamp),
-                    pose: odometry.pose,
-                    twist: Twist {
-                        linear_x: odometry.speed,
-                        linear_y: 0.0,
-                        angular: odometry.yaw_rate,
-                    },
-                };
                 self.measurements.timed(|| {
-                    localizer.on_odometry(&message).ok();
-                    localizer.predict(message.stamp)
+                    localizer.on_odometry(odometry).ok();
+                    localizer.predict(odometry.stamp)
                 })
             }
             ActivePoseSource::Odometry(map_from_odom, start) => {
@@ -333,39 +429,32 @@ impl CarRunner {
         }
     }
 
-    /// Gives a scan to the localizer and records how good the estimate is. Returns the pose now, if the scan changed it.
-    fn on_scan(&mut self, scan: &simulator::Scan, now: Stamp) -> Option<Pose> {
-        let message = Scan {
-            stamp: stamp(scan.stamp),
-            angle_min: scan.angle_min,
-            angle_increment: scan.angle_increment,
-            time_increment: scan.time_increment,
-            scan_time: None,
-            angle_max: None,
-            range_min: scan.range_min,
-            range_max: scan.range_max,
-            ranges: scan.ranges.clone(),
-        };
-        let truth = self.truth_at(message.stamp);
+    /// Gives a scan to the localizer and records how good the estimate is; `measured` is when the scan was taken. Returns the
+    /// pose now, if the scan changed it.
+    fn on_scan(&mut self, scan: &Scan, measured: Stamp, now: Stamp) -> Option<Pose> {
+        let truth = true_pose(&self.truths, measured);
         let ActivePoseSource::Localizer(localizer, monitor) = &mut self.pose_source else {
             // Without a localizer, the scan is judged at the pose by odometry, or at the true pose.
             let pose = match &self.pose_source {
                 ActivePoseSource::Odometry(map_from_odom, _) => {
                     let latest = self.latest?;
-                    let back = latest.stamp.as_secs_f64() - scan.stamp.as_secs_f64();
-                    let moved = [latest.speed, 0.0, latest.yaw_rate].map(|rate| -rate * back);
+                    let back = latest.stamp.since(scan.stamp);
+                    let Twist {
+                        linear_x, angular, ..
+                    } = latest.twist;
+                    let moved = [linear_x, 0.0, angular].map(|rate| -rate * back);
                     (*map_from_odom)? * latest.pose * Pose::exp(moved)
                 }
                 _ => truth?,
             };
             let twist = self
                 .latest
-                .map_or([0.0; 2], |latest| [latest.speed, latest.yaw_rate]);
+                .map_or([0.0; 2], |latest| [latest.twist.linear_x, latest.twist.angular]);
             self.measurements
-                .scanned(&message, pose, twist, truth, None, self.base_link_from_laser);
+                .scanned(scan, pose, twist, truth, None, self.base_link_from_laser);
             return None;
         };
-        let update = match self.measurements.timed_update(|| localizer.on_scan(&message)) {
+        let update = match self.measurements.timed_update(|| localizer.on_scan(scan)) {
             Ok(update) => update,
             Err(cause) => {
                 monitor.on_refused_scan(now, cause);
@@ -376,28 +465,59 @@ impl CarRunner {
         self.measurements.judged(update.stamp, state, update.pose, truth);
         let twist = [update.twist.linear_x, update.twist.angular];
         self.measurements.scanned(
-            &message,
+            scan,
             update.pose,
             twist,
             truth,
             Some(update.alignment),
             self.base_link_from_laser,
         );
-        localizer.predict(stamp(self.latest?.stamp))
+        localizer.predict(self.latest?.stamp)
     }
+}
 
-    /// The true pose at `time`, interpolated.
-    fn truth_at(&self, time: Stamp) -> Option<Pose> {
-        let after = self.truths.partition_point(|(stamp, _)| *stamp < time);
-        let (t1, to) = *self.truths.get(after)?;
-        let (t0, from) = *self.truths.get(after.checked_sub(1)?)?;
-        let share = time.since(t0) / t1.since(t0);
-        Some(Pose::new(
-            from.x + share * (to.x - from.x),
-            from.y + share * (to.y - from.y),
-            from.heading + share * wrap_angle(to.heading - from.heading),
-        ))
-    }
+/// The true pose at `time`, interpolated.
+fn true_pose(truths: &VecDeque<(Stamp, Pose)>, time: Stamp) -> Option<Pose> {
+    let after = truths.partition_point(|(stamp, _)| *stamp < time);
+    let (t1, to) = *truths.get(after)?;
+    let (t0, from) = *truths.get(after.checked_sub(1)?)?;
+    let share = time.since(t0) / t1.since(t0);
+    Some(Pose::new(
+        from.x + share * (to.x - from.x),
+        from.y + share * (to.y - from.y),
+        from.heading + share * wrap_angle(to.heading - from.heading),
+    ))
+}
+
+/// What a sensor of a simulated car delivers, as a localizer takes it; None for other messages.
+fn sensor_event(message: &Message) -> Option<SensorEvent> {
+    Some(match message {
+        Message::Odometry(odometry) => SensorEvent::Odometry(Odometry {
+            stamp: stamp(odometry.stamp),
+            pose: odometry.pose,
+            twist: Twist {
+                linear_x: odometry.speed,
+                linear_y: 0.0,
+                angular: odometry.yaw_rate,
+            },
+        }),
+        Message::Gyro(gyro) => SensorEvent::YawRate(YawRate {
+            stamp: stamp(gyro.stamp),
+            rate: gyro.yaw_rate,
+        }),
+        Message::Scan(scan) => SensorEvent::Scan(Scan {
+            stamp: stamp(scan.stamp),
+            angle_min: scan.angle_min,
+            angle_increment: scan.angle_increment,
+            time_increment: scan.time_increment,
+            scan_time: None,
+            angle_max: None,
+            range_min: scan.range_min,
+            range_max: scan.range_max,
+            ranges: scan.ranges.clone(),
+        }),
+        _ => return None,
+    })
 }
 
 /// The simulator's time as a stamp. It starts at zero; a localizer only uses differences.
@@ -430,6 +550,7 @@ mod tests {
             pose_source,
             speed_scale: 1.0,
             seed: 5,
+            defects: Vec::new(),
         }
     }
 
@@ -539,6 +660,35 @@ mod tests {
         };
         let results = race(&track, &map, &setup).expect("a race");
         assert!(results[0].crashes > 0);
+    }
+
+    #[test]
+    fn a_race_with_mild_defects_of_map_and_sensors_is_driven_to_its_end() {
+        let (track, map) = club();
+        let defect = |text: &str| text.parse::<crate::stress::DefectChoice>().expect(text).one();
+        let names = [
+            "wall-missing:mild",
+            "range-noise:mild",
+            "slow-scans:mild",
+            "bursts:mild",
+            "people:mild",
+        ];
+        let with = |defects: Vec<Defect>| {
+            let hq = LocalizerParameters::named("hq").expect("ships");
+            let setup = RaceSetup {
+                defects,
+                ..setup(PoseSource::Localizer(hq), 1, 1)
+            };
+            race(&track, &map, &setup).expect("a race").remove(0)
+        };
+        let (sound, damaged) = (with(Vec::new()), with(names.map(defect).to_vec()));
+        assert!(damaged.finished && damaged.crashes == 0, "{damaged:?}");
+        let rmse = |car: &CarResult| car.pose_error.expect("errors").position_error_m.rmse;
+        assert!(rmse(&damaged) > rmse(&sound), "the defects have an effect");
+        assert!(rmse(&damaged) < 0.3, "{}", rmse(&damaged));
+        // What is no defect of a race changes nothing.
+        let kidnap = with(vec![defect("kidnap")]);
+        assert_eq!(rmse(&kidnap), rmse(&sound));
     }
 
     #[test]

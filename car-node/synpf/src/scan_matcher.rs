@@ -135,7 +135,7 @@ pub(crate) fn match_scan(
         let length = step[0].hypot(step[1]);
         let step = step * (0.3 / length.max(0.3)).min(0.1 / step[2].abs().max(0.1));
         pose = Pose::new(pose.x - step[0], pose.y - step[1], pose.heading - step[2]);
-        let settled = length < 2e-4 && step[2].abs() < 1e-4;
+        let settled = length < SETTLED[0] && step[2].abs() < SETTLED[1];
         if settled && reach <= least_reach {
             break;
         }
@@ -158,6 +158,9 @@ pub(crate) fn match_scan(
         covariance: covariance * noise * covariance,
     }
 }
+
+/// Steps smaller than this end the fit \[m\], \[rad\]: with each the step shrinks to a tenth or less.
+const SETTLED: [f64; 2] = [1e-3, 5e-4];
 
 /// The gain of a direction changes along a track, and an estimate holds the errors of where it was less: so many times the memory
 /// that the present gain has. At 1 a covariance on ragged and bent maps is half as large as it should be; without a bound

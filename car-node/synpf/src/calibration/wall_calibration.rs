@@ -99,6 +99,7 @@ impl WallCalibration {
         let (mut began, mut last, mut pull) = ([f32::MAX; 2], [f32::MAX; 2], 0.0f32);
         let (mut together, mut own, mut view) = (0.0f32, 0.0f32, 0.0f32);
         let mut deviations = [0.0f32; MOST];
+        let gap = GAP * (stride as f32).max(1.0);
         let mut count = 0;
         for point in points.iter().step_by(stride) {
             let (dx, dy) = (cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]);
@@ -111,15 +112,15 @@ impl WallCalibration {
             let weight = 1.0 / (1.0 + ratio * ratio).powi(2);
             sum += weight * sample.distance;
             total += weight;
-            let distance = |from: [f32; 2]| (point[0] - from[0]).hypot(point[1] - from[1]);
-            if distance(began) > STRETCH || distance(last) > GAP * (stride as f32).max(1.0) {
+            let squared = |from: [f32; 2]| (point[0] - from[0]).powi(2) + (point[1] - from[1]).powi(2);
+            if squared(began) > STRETCH * STRETCH || squared(last) > gap * gap {
                 together += pull * pull;
                 (began, pull) = (*point, 0.0);
             }
             last = *point;
             pull += weight * deviation;
             own += (weight * deviation).powi(2);
-            view += weight * point[0].hypot(point[1]);
+            view += weight * (point[0] * point[0] + point[1] * point[1]).sqrt();
             if deviation.abs() < REACH {
                 deviations[count] = deviation.abs();
                 count += 1;

@@ -42,17 +42,17 @@ pub(crate) enum Continued {
     Unknown,
 }
 
-/// Directions in which the outline is kept. Half a degree: as fine as common scanners are.
-const DIRECTIONS: usize = 720;
+/// Directions in which the outline is kept: a degree each.
+const DIRECTIONS: usize = 360;
 
 /// An end point is compared with those so many directions to both sides: odometry errs in heading, and walls are slanted.
-const NEIGHBOURS: usize = 3;
+const NEIGHBOURS: usize = 2;
 
 /// A range that differs by less than this agrees \[m\], and by this share of itself.
 const TOLERANCE: [f32; 2] = [0.15, 0.02];
 
 /// Points of a reference, and of a scan compared with it.
-const POINTS: [usize; 2] = [360, 60];
+const POINTS: [usize; 2] = [180, 60];
 
 /// With fewer beams to compare nothing is said.
 const FEWEST: usize = 8;
@@ -189,7 +189,7 @@ fn polar(x: f32, y: f32) -> (usize, f32) {
     let angle = if x < 0.0 { PI - acute } else { acute };
     let angle = if y < 0.0 { -angle } else { angle };
     let index = ((angle + PI) * (DIRECTIONS as f32 / (2.0 * PI))) as usize;
-    (index.min(DIRECTIONS - 1), ax.hypot(ay))
+    (index.min(DIRECTIONS - 1), (ax * ax + ay * ay).sqrt())
 }
 
 #[cfg(test)]

@@ -233,9 +233,8 @@ impl SynPf {
             &parameters.refinement,
         );
         let estimate = fit.estimate;
-        self.tracker.estimate = estimate;
+        self.tracker.update(predicted, &fit);
         let turn = rotation(estimate.pose.heading);
-        self.tracker.covariance = fit.covariance;
         self.tracker.sweep_error = turn * calibration.sweep_error(step.sweep) * turn.transpose();
 
         let drive = self.odometry.drive();

@@ -661,6 +661,28 @@ fn sensors_of_another_clock_are_put_on_one() {
         // Up to the latency of the scans, which nobody knows.
         assert!((found.since(expected) - 0.02).abs() < 1e-3);
     }
+    // Some drivers stamp a scan when its sweep has ended.
+    let swept = |late: f64| {
+        let mut drive = with(|message| {
+            if let Content::Scan(scan) = &mut message.content {
+                scan.time_increment = 0.01875 / 39.0;
+            }
+        });
+        for message in &mut drive {
+            if let Content::Scan(scan) = &mut message.content {
+                scan.header.stamp = message.at.plus(-late).into();
+            }
+        }
+        log_of(&drive)
+    };
+    let log = swept(0.001);
+    says(&log, &["/scan: scans arrive 1.0 ms after", "last beam"]);
+    for (found, expected) in stamps(&log).iter().zip(stamps(&expected)) {
+        // Sent 20 ms after the first beam, 1 ms after the last.
+        assert!((found.since(expected) - 0.00025).abs() < 1e-6);
+    }
+    assert!(swept(0.02).notes.is_empty(), "as a scanner should");
+
     let zero = with(|message| {
         if let Content::Scan(scan) = &mut message.content {
             scan.header.stamp = Stamp(0).into();

@@ -79,6 +79,7 @@ impl Bag {
         let mut imu_events = imu.map_or(Vec::new(), |(_, imu)| {
             events(imu, |m| SensorEvent::YawRate(m.to_yaw_rate()))
         });
+        stamps_to_first_beams(scan_topic, &mut scan_events, &mut notes);
         let mut streams = [
             (odometry_topic, &mut odometry_events),
             (scan_topic, &mut scan_events),
@@ -454,6 +455,42 @@ fn events<T>(messages: &[(Stamp, T)], event: impl Fn(&T) -> SensorEvent) -> Vec<
             event: event(message),
         })
         .collect()
+}
+
+/// Stamps of the last beam become those of the first. A scan cannot arrive before its sweep has ended: one that is there before
+/// half of its sweep after its stamp was stamped at the end.
+fn stamps_to_first_beams(topic: &str, scans: &mut [Arrival], notes: &mut Vec<String>) {
+    /// Sweeps that are corrected last this long \[s\]. A pose at the first beam of a longer one would be too old for the health state.
+    const SWEEPS: std::ops::Range<f64> = 1e-3..0.04;
+    /// So many of the scans must have come so early.
+    const MOST: f64 = 0.9;
+    let sweep = |arrival: &Arrival| match &arrival.event {
+        SensorEvent::Scan(scan) => scan.time_increment * scan.ranges.len().saturating_sub(1) as f64,
+        _ => 0.0,
+    };
+    let early: Vec<f64> = scans
+        .iter()
+        .map(|arrival| (arrival, sweep(arrival)))
+        .filter(|(_, sweep)| SWEEPS.contains(sweep))
+        .map(|(arrival, sweep)| arrival.log_time.since(arrival.event.stamp()) / sweep)
+        .collect();
+    let Some(latest) = percentile(&early, MOST) else {
+        return;
+    };
+    if early.len() < scans.len() || !(-0.5..0.5).contains(&latest) {
+        return;
+    }
+    let milliseconds = sweep(&scans[0]) * 1e3;
+    notes.push(format!(
+        "{topic}: scans arrive {:.1} ms after their stamps, and a sweep takes {milliseconds:.1} ms: the stamps are taken to be of the \
+         last beam",
+        latest * milliseconds
+    ));
+    for arrival in scans {
+        let sweep = sweep(arrival);
+        let stamp = arrival.event.stamp_mut();
+        *stamp = stamp.plus(-sweep);
+    }
 }
 
 /// Puts sensors whose stamps are of another clock, such as the time since boot, on the clock of the others. Each arrival's

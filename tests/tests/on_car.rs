@@ -164,6 +164,8 @@ async fn a_cut_link_and_a_reboot_leave_no_hole_after_fetch_and_merge() {
     let filled = after[&first_run].len() - before[&first_run].len();
     assert!(filled > 10, "{filled} scans were only on the car");
     assert_eq!(report.summary.missing(), 0, "{}", report.summary);
+    let check = pitwall::check(&merged).expect("a recording");
+    assert!(check.complete && check.cars[0].confirmed, "{check}");
     for topic in [
         Topic::RecordedPose,
         Topic::RecordedOdometry,

@@ -259,6 +259,8 @@ struct Input<'a> {
     /// Events in memory, the earliest first.
     waiting: BinaryHeap<Reverse<Waiting>>,
     count: u64,
+    /// The last message of a car's file.
+    last: Option<Last>,
 }
 
 /// An event, ordered by time and then by its place in the file.
@@ -311,12 +313,20 @@ impl Input<'_> {
     }
 
     /// The event at its time by the laptop's clock; None for one of a car's that a laptop has.
-    fn placed(&self, mut event: FleetEvent) -> Option<FleetEvent> {
+    fn placed(&mut self, mut event: FleetEvent) -> Option<FleetEvent> {
         if !self.on_car {
             return Some(event);
         }
         let at = self.known.by_the_laptop(&event.car, event.at);
         event.at = at;
+        if let EventPayload::Message { header, .. } = &event.payload {
+            self.last = Some(Last {
+                at,
+                car: event.car.clone(),
+                run_id: header.run_id,
+                published: header.published,
+            });
+        }
         let wanted = match &event.payload {
             EventPayload::Message { topic, header, .. } => {
                 let stream = (event.car.clone(), *topic, header.run_id);
@@ -334,6 +344,69 @@ impl Input<'_> {
 
     fn next_at(&self) -> Option<i64> {
         self.waiting.peek().map(|Reverse(waiting)| waiting.at)
+    }
+}
+
+/// The last message of a car's file, at its time by the laptop's clock.
+struct Last {
+    at: i64,
+    car: CarName,
+    run_id: u64,
+    published: i64,
+}
+
+/// How far the streams of each car go.
+#[derive(Default)]
+struct Ends {
+    /// What a car answered at the end of a laptop's recording, the last of each car.
+    at_the_wall: BTreeMap<CarName, FleetEvent>,
+    /// The end of each car's own recording, and whether that was completed.
+    on_car: BTreeMap<CarName, (Last, bool)>,
+}
+
+impl Ends {
+    fn at_the_wall(&mut self, event: FleetEvent) {
+        let known = self.at_the_wall.get(&event.car);
+        if known.is_none_or(|known| known.at <= event.at) {
+            self.at_the_wall.insert(event.car.clone(), event);
+        }
+    }
+
+    fn file_ended(&mut self, last: Option<Last>, complete: bool) {
+        if let Some(last) = last
+            && self
+                .on_car
+                .get(&last.car)
+                .is_none_or(|(known, _)| known.at <= last.at)
+        {
+            self.on_car.insert(last.car.clone(), (last, complete));
+        }
+    }
+
+    /// The ends that are certain. A car that has completed its recording has said how far it goes.
+    fn last(mut self) -> Vec<FleetEvent> {
+        for (car, (last, complete)) in self.on_car {
+            let before = self
+                .at_the_wall
+                .get(&car)
+                .is_some_and(|event| event.at >= last.at);
+            if before {
+                continue;
+            }
+            // Without a completed file it is not certain that nothing followed.
+            self.at_the_wall.remove(&car);
+            if complete {
+                let payload = EventPayload::StreamEnds {
+                    run_id: last.run_id,
+                    published: last.published,
+                    outstanding: Vec::new(),
+                };
+                let at = last.at;
+                self.at_the_wall
+                    .insert(car.clone(), FleetEvent { at, car, payload });
+            }
+        }
+        self.at_the_wall.into_values().collect()
     }
 }
 
@@ -366,6 +439,7 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
     let mut written = 0;
     // What each car's first file begins with is enough.
     let mut introduced = HashSet::new();
+    let mut ends = Ends::default();
     loop {
         let earliest = open.iter().filter_map(|(_, input)| input.next_at()).min();
         if let Some((_, scan)) = closed.last()
@@ -379,6 +453,7 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
                 ended: false,
                 waiting: BinaryHeap::new(),
                 count: 0,
+                last: None,
             };
             input.fill()?;
             open.push((index, input));
@@ -397,13 +472,21 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
         };
         input.fill()?;
         let on_car = input.on_car;
-        open.retain(|(index, input)| {
+        open.retain_mut(|(index, input)| {
             let ended = input.next_at().is_none();
             if ended {
                 report[*index].damage = input.events.damage().to_vec();
+                if input.on_car {
+                    ends.file_ended(input.last.take(), input.events.complete());
+                }
             }
             !ended
         });
+        if let EventPayload::StreamEnds { .. } = event.payload {
+            // What follows in other recordings is wanted, too.
+            ends.at_the_wall(event);
+            continue;
+        }
         let message = matches!(event.payload, EventPayload::Message { .. });
         if on_car
             && !message
@@ -418,7 +501,12 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
         }
         written = total;
     }
-    let (summary, writer) = writer.finish().map_err(mcap)?;
+    for end in ends.last() {
+        writer.write(&end).map_err(mcap)?;
+    }
+    let (mut summary, writer) = writer.finish().map_err(mcap)?;
+    // Nobody was asked here.
+    summary.unanswered.clear();
     drop(writer);
     sync.sync_all().map_err(|e| RecordingError::io(to, e))?;
     Ok(Merged {

@@ -464,6 +464,9 @@ fn an_initial_pose_is_taken_from_its_own_topic_only() {
     }
 }
 
+/// A type, what its poses are of, and a message of it.
+type Sends<'a> = (&'static str, PoseOf, &'a dyn Fn() -> Vec<u8>);
+
 #[test]
 fn the_poses_of_another_localizer_are_taken_on_request_whatever_their_type() {
     let (router, endpoint) = router();
@@ -485,7 +488,7 @@ fn the_poses_of_another_localizer_are_taken_on_request_whatever_their_type() {
             transform: at(x),
         }],
     };
-    let sends: [(&str, PoseOf, &dyn Fn() -> Vec<u8>); 3] = [
+    let sends: [Sends; 3] = [
         ("nav_msgs::msg::dds_::Odometry_", PoseOf::Laser, &|| {
             bytes(&odometry(2.0))
         }),

@@ -152,8 +152,8 @@ pub(crate) struct Run {
     /// Raceline to measure progress along [default: raceline.csv beside the map, if it exists].
     #[arg(long, value_name = "FILE")]
     pub(crate) raceline: Option<PathBuf>,
-    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the first of --localizer, else the one last
-    /// in force, else hq].
+    /// Parameter set: hq, lq, adaptive, synpf-baseline, pose-graph, pose-graph-tuned, a YAML file, or a team's .lua for
+    /// Cartographer [default: the first of --localizer, else the one last in force, else hq].
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) params: Option<String>,
     /// Kind of localizer; without --params, its first set. `external` follows the one on --pose-topic.
@@ -318,7 +318,8 @@ pub(crate) struct Evaluate {
     /// What to run over.
     #[command(flatten)]
     pub(crate) bags: Bags,
-    /// Parameter set: hq, lq, adaptive, synpf-baseline, or a YAML file [default: the first of --localizer, else hq].
+    /// Parameter set: hq, lq, adaptive, synpf-baseline, pose-graph, pose-graph-tuned, a YAML file, or a team's .lua for
+    /// Cartographer [default: the first of --localizer, else hq].
     #[arg(long, value_name = "NAME|FILE")]
     pub(crate) params: Option<String>,
     /// Kind of localizer; without --params, its first set. `external` follows the one on --pose-topic.
@@ -397,7 +398,7 @@ pub(crate) struct Stress {
 }
 
 /// Arguments of `race`.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub(crate) struct Race {
     /// Track: club, hall, park, mirror, a folder, or a map.yaml of your own.
     #[arg(long, value_name = "NAME|FOLDER|MAP.yaml", default_value = "club")]
@@ -412,18 +413,19 @@ pub(crate) struct Race {
     /// Grip of the tyres.
     #[arg(long, value_enum, default_value = "hq")]
     pub(crate) odometry: Odometry,
-    /// Parameter set of the filter: hq, lq, adaptive, synpf-baseline, or a YAML file.
-    #[arg(long, value_name = "NAME|FILE", default_value = "hq")]
-    pub(crate) params: String,
-    /// Where the driver gets the car's pose from.
-    #[arg(long, value_enum, default_value = "synpf")]
-    pub(crate) localizer: PoseSource,
+    /// Parameter set: hq, lq, adaptive, synpf-baseline, pose-graph, pose-graph-tuned, a YAML file, or a team's .lua for
+    /// Cartographer [default: the first of --localizer, else hq].
+    #[arg(long, value_name = "NAME|FILE")]
+    pub(crate) params: Option<String>,
+    /// Where the driver gets the car's pose from [default: the localizer that --params is for].
+    #[arg(long, value_enum)]
+    pub(crate) localizer: Option<PoseSource>,
     /// Cars on the track, each with a localizer of its own, 1 to 20.
     #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = |text: &str| whole::<u8>(text, 1, 20))]
     pub(crate) cars: u8,
-    /// Races to run, each with the next seed, 1 to 1000.
-    #[arg(long, value_name = "N", default_value = "1", allow_negative_numbers = true, value_parser = |text: &str| whole::<u64>(text, 1, 1000))]
-    pub(crate) seeds: u64,
+    /// Races to run, each with the next seed, 1 to 1000 [default: 1; with --table 5].
+    #[arg(long, value_name = "N", allow_negative_numbers = true, value_parser = |text: &str| whole::<u64>(text, 1, 1000))]
+    pub(crate) seeds: Option<u64>,
     /// Seed of the first race.
     #[arg(long, value_name = "N", default_value = "0", allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: u64,
@@ -438,6 +440,9 @@ pub(crate) struct Race {
     /// Run the paper's grid (every localizer on both tyres) and print it beside table I of the paper.
     #[arg(long, conflicts_with_all = ["odometry", "params", "localizer", "cars", "faults"])]
     pub(crate) table: bool,
+    /// With --table: write a page with the tables, the deviation along the track and the distributions to this file.
+    #[arg(long, value_name = "OUT.html", requires = "table")]
+    pub(crate) html: Option<PathBuf>,
     /// One JSON object on stdout; an array of rows with --table.
     #[arg(long)]
     pub(crate) json: bool,
@@ -450,6 +455,8 @@ pub(crate) enum LocalizerKind {
     Synpf,
     /// The emulation of the reference.
     SynpfBaseline,
+    /// Pose-graph localization, after Cartographer.
+    PoseGraph,
     /// Another program, such as AMCL or Cartographer.
     External,
 }
@@ -467,10 +474,12 @@ pub(crate) enum PosedFrame {
 /// Where the driver gets the pose from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum PoseSource {
-    /// SynPF with the set that --params names.
+    /// SynPF.
     Synpf,
-    /// The reference emulation; --params does not matter.
+    /// The emulation of the reference.
     SynpfBaseline,
+    /// Pose-graph localization, after Cartographer.
+    PoseGraph,
     /// Wheel odometry alone.
     Odometry,
     /// The true pose.

@@ -31,7 +31,7 @@ use synpf::{Stamp, TrackMap};
 
 /// The car drives this long before the first switch, and then under each set \[s\].
 const BEFORE: f64 = 4.0;
-const UNDER_EACH: f64 = 1.5;
+const UNDER_EACH: f64 = 1.2;
 
 /// The reference is off by up to 0.3 m here.
 const NEAR: f64 = 0.5;

@@ -35,7 +35,7 @@ use maps::Pose;
 pub use external_pose::{ExternalPose, PoseOf};
 pub use hand_over::{HandOver, HandedEstimate};
 pub use parameters::{ParameterFault, ParameterValues, PreparedParameters, overlay, to_values};
-pub use scan_fit::ScanFit;
+pub use scan_fit::{ScanFit, leaves_map};
 pub use sensor_finding::{SensorFinding, SensorFindings};
 pub use sensors::{Odometry, Scan, Twist, YawRate};
 pub use stamp::Stamp;

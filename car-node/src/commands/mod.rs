@@ -17,6 +17,8 @@ pub(crate) mod health;
 pub(crate) mod import;
 pub(crate) mod placement;
 pub(crate) mod race;
+mod race_page;
+mod race_table;
 pub(crate) mod run;
 pub(crate) mod stress;
 pub(crate) mod track;
@@ -144,6 +146,7 @@ fn chosen_set(params: Option<&str>, localizer: Option<LocalizerKind>) -> anyhow:
         LocalizerKind::Synpf => ("hq", "synpf"),
         LocalizerKind::SynpfBaseline => ("synpf-baseline", "reference"),
         LocalizerKind::External => (EXTERNAL, EXTERNAL),
+        LocalizerKind::PoseGraph => ("pose-graph", "pose-graph"),
     });
     let Some(name) = params.or(first.map(|(name, _)| name)) else {
         return Ok(None);

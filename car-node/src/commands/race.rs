@@ -6,9 +6,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use car_node::localization::LocalizerParameters;
-use car_node::race::{
-    CarResult, PAPER_ROWS, PoseSource, Quality, RaceSetup, RaceSummary, SPEED_SCALE, applies_to_races, race,
-};
+use car_node::race::{CarResult, PoseSource, Quality, RaceSetup, RaceSummary, applies_to_races, race};
 use car_node::statistics::MeanSigma;
 use car_node::stress::Defect;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -17,24 +15,24 @@ use serde::Serialize;
 use simulator::{Track, TrackReport};
 use synpf::TrackMap;
 
-use super::{BadUsage, find_track, load_set};
-use crate::cli;
+use super::{BadUsage, chosen_set, find_track, load_set, race_table};
+use crate::cli::{self, LocalizerKind};
 
 /// The races of one localizer on one tyre, as reported.
 #[derive(Debug, Serialize)]
-struct Report {
-    track: String,
-    localizer: String,
-    odometry: Quality,
+pub(super) struct Report {
+    pub(super) track: String,
+    pub(super) localizer: String,
+    pub(super) odometry: Quality,
     laps_each: u32,
-    seeds: Vec<u64>,
+    pub(super) seeds: Vec<u64>,
     /// The defects of `--faults`, as `KIND:GRADE`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     faults: Vec<String>,
-    summary: RaceSummary,
+    pub(super) summary: RaceSummary,
     /// By seed, then by car; not in tables.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    races: Vec<Vec<CarResult>>,
+    pub(super) races: Vec<Vec<CarResult>>,
 }
 
 /// Exit code when a car crashed or did not finish. Wrong usage is 2, a faulty file is 1.
@@ -49,7 +47,7 @@ pub(crate) fn run(arguments: &cli::Race) -> anyhow::Result<ExitCode> {
     let map = Arc::new(map);
     if arguments.table {
         // The rows are for comparison, and some are expected to crash.
-        return table(arguments, &track, &map).map(|()| ExitCode::SUCCESS);
+        return race_table::run(arguments, &track, &map).map(|()| ExitCode::SUCCESS);
     }
     let (localizer, pose_source) = chosen(arguments)?;
     let quality = match arguments.odometry {
@@ -86,32 +84,42 @@ fn faults(arguments: &cli::Race) -> anyhow::Result<Vec<Defect>> {
 
 /// The pose source that the arguments ask for, with its title.
 fn chosen(arguments: &cli::Race) -> anyhow::Result<(String, PoseSource)> {
-    Ok(match arguments.localizer {
-        cli::PoseSource::Synpf => {
-            let set = load_set(&arguments.params)?;
-            (
-                format!("synpf {}", set.name),
-                PoseSource::Localizer(set.parameters),
-            )
-        }
-        cli::PoseSource::SynpfBaseline => shipped("synpf-baseline")?,
-        cli::PoseSource::Odometry => ("odometry".into(), PoseSource::Odometry),
-        cli::PoseSource::Truth => ("truth".into(), PoseSource::Truth),
-    })
+    let kind = match arguments.localizer {
+        Some(cli::PoseSource::Odometry) => return Ok(("odometry".into(), PoseSource::Odometry)),
+        Some(cli::PoseSource::Truth) => return Ok(("truth".into(), PoseSource::Truth)),
+        Some(cli::PoseSource::Synpf) => Some(LocalizerKind::Synpf),
+        Some(cli::PoseSource::SynpfBaseline) => Some(LocalizerKind::SynpfBaseline),
+        Some(cli::PoseSource::PoseGraph) => Some(LocalizerKind::PoseGraph),
+        None => None,
+    };
+    let set = match chosen_set(arguments.params.as_deref(), kind)? {
+        Some(set) => set,
+        None => load_set("hq")?,
+    };
+    Ok(titled(&set.name, set.parameters))
 }
 
-fn shipped(name: &str) -> anyhow::Result<(String, PoseSource)> {
+pub(super) fn shipped(name: &str) -> anyhow::Result<(String, PoseSource)> {
     let parameters = LocalizerParameters::named(name).with_context(|| format!("no parameter set {name}"))?;
-    let title = if name.starts_with("synpf") {
+    Ok(titled(name, parameters))
+}
+
+/// A localizer's title says its kind and its set.
+fn titled(name: &str, parameters: LocalizerParameters) -> (String, PoseSource) {
+    let kind = match parameters.kind() {
+        "reference" => "synpf",
+        kind => kind,
+    };
+    let title = if name.starts_with(kind) {
         name.into()
     } else {
-        format!("synpf {name}")
+        format!("{kind} {name}")
     };
-    Ok((title, PoseSource::Localizer(parameters)))
+    (title, PoseSource::Localizer(parameters))
 }
 
 /// Runs one race for each seed, in parallel on all cores.
-fn races(
+pub(super) fn races(
     arguments: &cli::Race,
     track: &Arc<Track>,
     map: &Arc<TrackMap>,
@@ -119,7 +127,7 @@ fn races(
     pose_source: PoseSource,
     quality: Quality,
 ) -> anyhow::Result<Report> {
-    let seeds: Vec<u64> = (0..arguments.seeds)
+    let seeds: Vec<u64> = (0..arguments.seeds.unwrap_or(1))
         .map(|i| arguments.seed.wrapping_add(i))
         .collect();
     let setup = RaceSetup {
@@ -171,126 +179,26 @@ fn progress_bar(races: u64, localizer: &str, quality: Quality) -> ProgressBar {
     bar
 }
 
-fn name(quality: Quality) -> &'static str {
+pub(super) fn name(quality: Quality) -> &'static str {
     match quality {
         Quality::Hq => "HQ",
         Quality::Lq => "LQ",
     }
 }
 
-/// The paper's grid.
-fn table(arguments: &cli::Race, track: &Arc<Track>, map: &Arc<TrackMap>) -> anyhow::Result<()> {
-    let mut rows = vec![(shipped("hq")?, Quality::Hq), (shipped("lq")?, Quality::Lq)];
-    for pose_source in [
-        shipped("synpf-baseline")?,
-        ("odometry".into(), PoseSource::Odometry),
-        ("truth".into(), PoseSource::Truth),
-    ] {
-        rows.extend([Quality::Hq, Quality::Lq].map(|quality| (pose_source.clone(), quality)));
-    }
-    let mut reports = Vec::new();
-    for ((localizer, pose_source), quality) in rows {
-        let mut report = races(arguments, track, map, localizer, pose_source, quality)?;
-        report.races.clear();
-        reports.push(report);
-    }
-    if arguments.json {
-        say!("{}", serde_json::to_string_pretty(&reports)?);
-    } else {
-        print_table(arguments, &reports);
-    }
-    Ok(())
-}
-
 /// The value, or a dash.
-fn or_dash(value: Option<f64>, scale: f64, digits: usize) -> String {
+pub(super) fn or_dash(value: Option<f64>, scale: f64, digits: usize) -> String {
     value.map_or("-".into(), |v| format!("{:.digits$}", v * scale))
 }
 
-fn mean_sigma(value: Option<MeanSigma>, scale: f64, digits: usize) -> String {
+pub(super) fn mean_sigma(value: Option<MeanSigma>, scale: f64, digits: usize) -> String {
     value.map_or("-".into(), |v| {
         format!("{:.digits$} ± {:.digits$}", v.mean * scale, v.sigma * scale)
     })
 }
 
-fn print_table(arguments: &cli::Race, reports: &[Report]) {
-    say!(
-        "laps on {}: {} with each of {} seeds; error to the line by the estimate, as the paper takes it, and by the truth",
-        reports.first().map_or("", |report| &report.track),
-        arguments.laps,
-        arguments.seeds
-    );
-    say!(
-        "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
-        "localizer",
-        "odom",
-        "lap time",
-        "error to line",
-        "true",
-        "align paper",
-        "ours",
-        "pos rmse",
-        "hdg rmse",
-        "load",
-        "crashes"
-    );
-    say!(
-        "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
-        "",
-        "",
-        "s",
-        "cm",
-        "cm",
-        "%",
-        "%",
-        "cm",
-        "deg",
-        "% core",
-        ""
-    );
-    for report in reports {
-        let s = &report.summary;
-        say!(
-            "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7.2} {:>8}",
-            report.localizer,
-            name(report.odometry),
-            mean_sigma(s.lap_time_s, 1.0, 3),
-            mean_sigma(s.line_error_m, 100.0, 2),
-            or_dash(s.true_line_error_m.map(|error| error.mean), 100.0, 2),
-            or_dash(s.alignment_paper, 100.0, 2),
-            or_dash(s.alignment, 100.0, 2),
-            or_dash(s.position_rmse_m, 100.0, 2),
-            or_dash(s.heading_rmse_rad, 1_f64.to_degrees(), 2),
-            s.load.cpu * 100.0,
-            crashes(s),
-        );
-    }
-    say!(
-        "lap times are calibrated: {SPEED_SCALE} of the raceline's speed on all tyres gives the paper's on clean ones; compare with \
-         the rows of the truth"
-    );
-    say!("the paper, table I (10 laps of a real car on its own track, both tyres at one speed scaling):");
-    for row in PAPER_ROWS {
-        let pair = |[mean, sigma]: [f64; 2]| Some(MeanSigma { mean, sigma });
-        say!(
-            "{:<16} {:<4} {:>15} {:>15} {:>6} {:>11} {:>8} {:>8} {:>8} {:>7} {:>8}",
-            row.localizer,
-            name(row.quality),
-            mean_sigma(pair(row.lap_time_s), 1.0, 3),
-            mean_sigma(pair(row.line_error_m), 100.0, 2),
-            "-",
-            or_dash(Some(row.alignment), 100.0, 2),
-            "-",
-            "-",
-            "-",
-            or_dash(row.load, 1.0, 2),
-            "-"
-        );
-    }
-}
-
 /// The number of crashes, marked if a car did not finish.
-fn crashes(summary: &RaceSummary) -> String {
+pub(super) fn crashes(summary: &RaceSummary) -> String {
     if summary.finished == summary.started {
         summary.crashes.to_string()
     } else {

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use maps::MapError;
+use pose_graph::LuaConfiguration;
 use protocol::ValueChange;
 use serde_json::Value;
 use synpf::ParameterFault;
@@ -41,7 +42,7 @@ pub enum SetError {
     },
 }
 
-/// The shipped set of that name, or else the YAML file at that path.
+/// The shipped set of that name, or else the file at that path: YAML, or a team's Lua configuration of Cartographer (`.lua`).
 pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
     if let Some(parameters) = LocalizerParameters::named(name_or_path) {
         return Ok(NamedSet {
@@ -59,7 +60,15 @@ pub fn load(name_or_path: &str) -> Result<NamedSet, SetError> {
         path: path.into(),
         faults,
     };
-    let (parameters, unknown_keys) = LocalizerParameters::from_yaml(&text).map_err(faulty)?;
+    let lua = path
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("lua"));
+    let (parameters, unknown_keys) = if lua {
+        let read = LuaConfiguration::parse(&text).map_err(faulty)?;
+        (read.parameters.into(), read.ignored)
+    } else {
+        LocalizerParameters::from_yaml(&text).map_err(faulty)?
+    };
     parameters.validate().map_err(faulty)?;
     Ok(NamedSet {
         name: path

@@ -129,7 +129,7 @@ pub fn steps(target: &LocalizerParameters) -> Result<Vec<Step>, Vec<ParameterFau
             let groups = groups(&plain, target, &IMPROVEMENTS);
             (plain, groups)
         }
-        LocalizerParameters::External(_) => {
+        LocalizerParameters::External(_) | LocalizerParameters::PoseGraph(_) => {
             return Err(vec![ParameterFault {
                 key: KIND_KEY.into(),
                 fault: format!("{} is no improvement of the reference", target.kind()),

@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use maps::Pose;
+use pose_graph::{FrozenMap, PoseGraph, PoseGraphParameters, PoseGraphTuning};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use synpf::{
@@ -25,6 +26,8 @@ pub enum LocalizerParameters {
     Reference(Box<ReferenceParameters>),
     /// For following another localizer.
     External(ExternalParameters),
+    /// For pose-graph localization.
+    PoseGraph(Box<PoseGraphParameters>),
 }
 
 /// The key that says which kind of localizer a set is for.
@@ -33,6 +36,7 @@ const SYNPF: &str = "synpf";
 const REFERENCE: &str = "reference";
 /// The kind that follows another localizer, and its set.
 pub const EXTERNAL: &str = "external";
+const POSE_GRAPH: &str = "pose-graph";
 
 /// A key from the time when the reference was a mode of SynPF. Only sets for that mode had it.
 const FORMER_KEY: &str = "defect_update_per_odometry";
@@ -69,9 +73,22 @@ impl From<ExternalParameters> for LocalizerParameters {
     }
 }
 
+impl From<PoseGraphParameters> for LocalizerParameters {
+    fn from(parameters: PoseGraphParameters) -> Self {
+        Self::PoseGraph(Box::new(parameters))
+    }
+}
+
 impl LocalizerParameters {
     /// The names of the sets that ship for every car. [`EXTERNAL`] is one for cars with another localizer.
-    pub const NAMES: [&'static str; 4] = ["hq", "lq", "adaptive", "synpf-baseline"];
+    pub const NAMES: [&'static str; 6] = [
+        "hq",
+        "lq",
+        "adaptive",
+        "synpf-baseline",
+        "pose-graph",
+        "pose-graph-tuned",
+    ];
 
     /// A set that ships, by name.
     pub fn named(name: &str) -> Option<Self> {
@@ -81,11 +98,13 @@ impl LocalizerParameters {
         if name == EXTERNAL {
             return Some(ExternalParameters::default().into());
         }
-        Parameters::named(name).map(Into::into)
+        let synpf = Parameters::named(name).map(Into::into);
+        synpf.or_else(|| PoseGraphParameters::named(name).map(Into::into))
     }
 
     /// Reads a flat YAML file. With `localizer: reference` it is a set for the reference emulation, under the names of
-    /// `pf2_params.yaml`; without, one for SynPF, which understands those names too. Returns the set and the keys that are
+    /// `pf2_params.yaml`; with `localizer: pose-graph` one for pose-graph localization, under Cartographer's names; without,
+    /// one for SynPF, which understands the reference's names too. Returns the set and the keys that are
     /// unknown, for a warning.
     pub fn from_yaml(text: &str) -> Result<(Self, Vec<String>), Vec<ParameterFault>> {
         let mut table = parameter_table(text)?;
@@ -93,6 +112,7 @@ impl LocalizerParameters {
         match kind_of(kind.as_ref()).map_err(|fault| vec![fault])? {
             SYNPF => Parameters::from_table(&table).map(|(set, unknown)| (set.into(), unknown)),
             EXTERNAL => with(ExternalParameters::default().with_values(table)),
+            POSE_GRAPH => with(PoseGraphParameters::default().with_values(table)),
             _ => ReferenceParameters::from_table(table).map(|(set, unknown)| (set.into(), unknown)),
         }
     }
@@ -105,17 +125,19 @@ impl LocalizerParameters {
                 kind if kind == self.kind() => self.clone(),
                 SYNPF => Parameters::default().into(),
                 EXTERNAL => ExternalParameters::default().into(),
+                POSE_GRAPH => PoseGraphParameters::default().into(),
                 _ => ReferenceParameters::default().into(),
             },
         })
     }
 
-    /// Which kind of localizer it is for: `synpf`, `reference` or `external`.
+    /// Which kind of localizer it is for: `synpf`, `reference`, `pose-graph` or `external`.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::SynPf(_) => SYNPF,
             Self::Reference(_) => REFERENCE,
             Self::External(_) => EXTERNAL,
+            Self::PoseGraph(_) => POSE_GRAPH,
         }
     }
 
@@ -125,6 +147,7 @@ impl LocalizerParameters {
             Self::SynPf(parameters) => parameters.to_values(),
             Self::Reference(parameters) => parameters.to_values(),
             Self::External(parameters) => parameters.to_values(),
+            Self::PoseGraph(parameters) => parameters.to_values(),
         };
         values.insert(KIND_KEY.into(), self.kind().into());
         values
@@ -142,6 +165,7 @@ impl LocalizerParameters {
             Self::SynPf(base) => with(base.with_values(given)),
             Self::Reference(base) => with(base.with_values(given)),
             Self::External(base) => with(base.with_values(given)),
+            Self::PoseGraph(base) => with(base.with_values(given)),
         }
     }
 
@@ -151,6 +175,7 @@ impl LocalizerParameters {
             Self::SynPf(parameters) => parameters.validate(),
             Self::Reference(parameters) => parameters.validate(),
             Self::External(parameters) => parameters.validate(),
+            Self::PoseGraph(parameters) => parameters.validate(),
         }
     }
 
@@ -161,6 +186,8 @@ impl LocalizerParameters {
             Self::Reference(parameters) => Reference::prepare(map, map_from_base_link, parameters),
             // It casts few rays.
             Self::External(_) => {}
+            // It needs no range table.
+            Self::PoseGraph(_) => {}
         }
     }
 
@@ -179,6 +206,9 @@ impl LocalizerParameters {
             Self::External(parameters) => {
                 parameters.validate()?;
                 PreparedParameters::new(*parameters)
+            }
+            Self::PoseGraph(parameters) => {
+                PreparedParameters::new(PoseGraphTuning::new(PoseGraphParameters::clone(parameters))?)
             }
         })
     }
@@ -202,6 +232,17 @@ impl LocalizerParameters {
             }
             // It throws no dice.
             Self::External(parameters) => Box::new(External::new(map, base_link_from_laser, *parameters)?),
+            Self::PoseGraph(parameters) => {
+                let (grid, field) = map.shared();
+                let map = Arc::new(FrozenMap::new(grid, field));
+                let parameters = PoseGraphParameters::clone(parameters);
+                let localizer =
+                    PoseGraph::new(map, base_link_from_laser, parameters).map_err(|error| match error {
+                        pose_graph::SetUpError::Parameters(faults) => SetUpError::Parameters(faults),
+                        pose_graph::SetUpError::Pose(error) => SetUpError::Pose(error),
+                    })?;
+                Box::new(localizer)
+            }
         })
     }
 }
@@ -217,11 +258,12 @@ fn kind_of(value: Option<&Value>) -> Result<&'static str, ParameterFault> {
     match value.map(Value::as_str) {
         None | Some(Some(SYNPF)) => Ok(SYNPF),
         Some(Some(REFERENCE)) => Ok(REFERENCE),
+        Some(Some(POSE_GRAPH)) => Ok(POSE_GRAPH),
         Some(Some(EXTERNAL)) => Ok(EXTERNAL),
         Some(_) => Err(ParameterFault {
             key: KIND_KEY.into(),
             fault: format!(
-                "{} is none of {SYNPF}, {REFERENCE}, {EXTERNAL}",
+                "{} is none of {SYNPF}, {REFERENCE}, {POSE_GRAPH}, {EXTERNAL}",
                 value.unwrap_or(&Value::Null)
             ),
         }),
@@ -251,6 +293,11 @@ impl TryFrom<ParameterValues> for LocalizerParameters {
         }
         let kind = kind_of(kind.as_ref()).map_err(|fault| fault.to_string())?;
         let values = Value::Object(values.into_iter().collect());
+        if kind == POSE_GRAPH {
+            let set: PoseGraphParameters =
+                serde_json::from_value(values).map_err(|error| error.to_string())?;
+            return Ok(set.into());
+        }
         if kind == EXTERNAL {
             let set: ExternalParameters =
                 serde_json::from_value(values).map_err(|error| error.to_string())?;

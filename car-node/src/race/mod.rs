@@ -21,7 +21,7 @@ use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist, YawRa
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use paper::{PAPER_ROWS, PaperRow};
-pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary};
+pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary, Stretch};
 
 use crate::health::{Monitor, Thresholds};
 use crate::localization::LocalizerParameters;
@@ -340,7 +340,8 @@ impl CarRunner {
                 self.latest = Some(*odometry);
                 let pose = self.on_odometry(odometry, world, index)?;
                 self.measurements.on_a_lap = world.on_a_lap(index);
-                self.measurements.driven(pose, world.truth(index).track.d);
+                let at = world.truth(index).track;
+                self.measurements.driven(pose, at.s, at.d);
                 pose
             }
             SensorEvent::YawRate(reading) => {

@@ -27,6 +27,78 @@ pub struct LapRecord {
     pub alignment_paper: f64,
 }
 
+/// Mean deviations on one stretch of the track.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Stretch {
+    /// Arc length of its middle along the raceline \[m\].
+    pub s_m: f64,
+    /// Mean distance of the *estimate* from the raceline \[m\].
+    pub line_error_m: f64,
+    /// Mean distance of the car from the raceline \[m\].
+    pub true_line_error_m: f64,
+}
+
+/// Stretches that a track is cut into.
+const STRETCHES: usize = 80;
+
+/// Sums over the stretches of a track: distances of the estimate and of the car from the raceline, and their number.
+#[derive(Debug, Clone)]
+struct StretchSums {
+    length: f64,
+    sums: Vec<[f64; 3]>,
+}
+
+impl StretchSums {
+    fn new(length: f64) -> Self {
+        Self {
+            length,
+            sums: vec![[0.0; 3]; STRETCHES],
+        }
+    }
+
+    fn add(&mut self, s: f64, line_error: f64, true_line_error: f64) {
+        let share = (s / self.length).rem_euclid(1.0);
+        if let Some(sums) = self.sums.get_mut((share * STRETCHES as f64) as usize) {
+            *sums = [sums[0] + line_error, sums[1] + true_line_error, sums[2] + 1.0];
+        }
+    }
+
+    /// The stretches that were driven on.
+    fn means(&self) -> Vec<Stretch> {
+        let per_stretch = self.length / STRETCHES as f64;
+        let driven = self.sums.iter().enumerate().filter(|(_, sums)| sums[2] > 0.0);
+        driven
+            .map(|(i, [estimated, driven, count])| Stretch {
+                s_m: (i as f64 + 0.5) * per_stretch,
+                line_error_m: estimated / count,
+                true_line_error_m: driven / count,
+            })
+            .collect()
+    }
+}
+
+/// Means over the cars, stretch by stretch.
+fn mean_stretches(cars: &[CarResult]) -> Vec<Stretch> {
+    let all = || cars.iter().flat_map(|car| &car.along_track);
+    let mut places: Vec<f64> = all().map(|stretch| stretch.s_m).collect();
+    places.sort_by(f64::total_cmp);
+    places.dedup_by(|a, b| (*a - *b).abs() < 1e-9);
+    places
+        .into_iter()
+        .map(|s_m| {
+            let here: Vec<&Stretch> = all().filter(|stretch| (stretch.s_m - s_m).abs() < 1e-9).collect();
+            let mean = |value: fn(&Stretch) -> f64| {
+                here.iter().map(|stretch| value(stretch)).sum::<f64>() / here.len() as f64
+            };
+            Stretch {
+                s_m,
+                line_error_m: mean(|stretch| stretch.line_error_m),
+                true_line_error_m: mean(|stretch| stretch.true_line_error_m),
+            }
+        })
+        .collect()
+}
+
 /// CPU time of the localizer on this machine.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct LoadSummary {
@@ -80,6 +152,8 @@ pub struct CarResult {
     pub finished: bool,
     /// The laps, in order.
     pub laps: Vec<LapRecord>,
+    /// Deviation along the track, over all laps.
+    pub along_track: Vec<Stretch>,
     /// Crashes: the car hit a wall and had to be put back.
     pub crashes: u32,
     /// Scrapes: the car touched a wall and drove on.
@@ -149,6 +223,10 @@ pub struct RaceSummary {
     pub spins: u32,
     /// Means over the cars.
     pub load: LoadSummary,
+    /// Deviation along the track, mean over the cars.
+    pub along_track: Vec<Stretch>,
+    /// Every lap of every car, in order.
+    pub every_lap: Vec<LapRecord>,
 }
 
 impl RaceSummary {
@@ -199,6 +277,8 @@ impl RaceSummary {
                 update_us_p99: load(|l| l.update_us_p99),
                 real_time_factor: load(|l| l.real_time_factor),
             },
+            along_track: mean_stretches(cars),
+            every_lap: laps,
         }
     }
 }
@@ -215,6 +295,7 @@ pub(super) struct CarMeasurements {
     pub(super) on_a_lap: bool,
     pose_errors: PoseErrors,
     states: States,
+    along_track: StretchSums,
     /// Of the lap being driven: distances of the estimate and of the car from the raceline.
     line_errors: Vec<f64>,
     true_line_errors: Vec<f64>,
@@ -227,6 +308,7 @@ pub(super) struct CarMeasurements {
 impl CarMeasurements {
     pub(super) fn new(track: Arc<Track>, map: Arc<TrackMap>) -> Self {
         Self {
+            along_track: StretchSums::new(track.raceline.length()),
             track,
             map,
             finished: Vec::new(),
@@ -265,14 +347,15 @@ impl CarMeasurements {
         result
     }
 
-    /// The driver got `estimate`, and the car was `true_d` \[m\] from the raceline.
-    pub(super) fn driven(&mut self, estimate: Pose, true_d: f64) {
+    /// The driver got `estimate`, and the car was at `s` \[m\] along the raceline, `true_d` \[m\] from it.
+    pub(super) fn driven(&mut self, estimate: Pose, s: f64, true_d: f64) {
         if !self.on_a_lap {
             return;
         }
         let d = self.track.raceline.project([estimate.x, estimate.y]).d;
         self.line_errors.push(d.abs());
         self.true_line_errors.push(true_d.abs());
+        self.along_track.add(s, d.abs(), true_d.abs());
     }
 
     /// A scan led to `estimate`. Estimate and truth are those at its stamp.
@@ -334,6 +417,7 @@ impl CarMeasurements {
         CarResult {
             finished,
             laps: self.finished,
+            along_track: self.along_track.means(),
             crashes: count(MishapKind::Crash),
             scrapes: count(MishapKind::Scrape),
             collisions: count(MishapKind::Collision),

@@ -19,21 +19,6 @@ pub(crate) struct Quality {
     pub(crate) long: f64,
 }
 
-/// Beams that are looked at.
-const BEAMS: usize = 60;
-
-/// Beams whose range is compared with the map's, which costs more.
-const CAST: usize = 20;
-
-/// Nearer than this to a wall, and the size of a cell, an end point is on it \[m\].
-const ALIGNED: f32 = 0.05;
-
-/// Finer cells than this do not make a laser better \[m\].
-const LEAST_CELL: f64 = 0.05;
-
-/// A range this far from the map's is another thing \[m\].
-const OTHER: f32 = 0.3;
-
 impl Quality {
     /// Alignment of the beams that no obstacle blocks ([`ScanFit::clear_alignment`]).
     pub(crate) fn clear_alignment(&self) -> f64 {
@@ -46,8 +31,7 @@ impl Quality {
         fit.clear_alignment()
     }
 
-    /// Judges a scan at a pose in the grid's frame. Beams that end where nothing was mapped ([`TrackMap::unmapped`]) are not
-    /// valid: they say nothing on the pose. At most half of a scan is excused so.
+    /// Judges a scan at a pose in the grid's frame ([`ScanFit::measure`]).
     pub(crate) fn new(map: &TrackMap, scan: &PreprocessedScan, pose: Pose) -> Self {
         Self::of_points(map, &scan.points, scan.base_link_from_laser, pose)
     }
@@ -59,50 +43,12 @@ impl Quality {
         base_link_from_laser: Pose,
         pose: Pose,
     ) -> Self {
-        let field = map.field();
-        let cells = 1.0 / field.resolution() as f32;
-        let aligned_within = ALIGNED + field.resolution().max(LEAST_CELL) as f32;
-        let stride = points.len().div_ceil(BEAMS).max(1);
-        let (sin, cos) = pose.heading.sin_cos();
-        let (sin, cos) = (sin as f32, cos as f32);
-        let (x, y) = (pose.x as f32, pose.y as f32);
-        let laser = pose * base_link_from_laser;
-        let (lx, ly) = (laser.x as f32, laser.y as f32);
-        let (mut count, mut aligned, mut residual, mut unmapped) = (0.0f32, 0.0f32, 0.0f32, 0.0f32);
-        let (mut cast, mut short, mut long) = (0.0f32, 0.0f32, 0.0f32);
-        for (k, point) in points.iter().step_by(stride).enumerate() {
-            let (px, py) = (
-                x + cos * point[0] - sin * point[1],
-                y + sin * point[0] + cos * point[1],
-            );
-            let distance = field
-                .from_wall(px * cells, py * cells)
-                .map_or(1.0, |d| d.min(1.0));
-            count += 1.0;
-            if distance < aligned_within {
-                aligned += 1.0;
-            } else if map.unmapped([lx, ly], [px, py]) {
-                unmapped += 1.0;
-                continue;
-            }
-            residual += distance;
-            if k % (BEAMS / CAST) == 0 {
-                let (dx, dy) = (px - lx, py - ly);
-                let range = dx.hypot(dy).max(1e-3);
-                let most = (range + 2.0 * OTHER) * cells;
-                let predicted = field.trace([lx * cells, ly * cells], [dx / range, dy / range], most) / cells;
-                cast += 1.0;
-                short += f32::from(range < predicted - OTHER);
-                long += f32::from(range > predicted + OTHER);
-            }
-        }
-        let share = |part: f32, of: f32| f64::from(part / of.max(1.0));
-        let valid = count - unmapped.min(0.5 * count);
+        let fit = ScanFit::measure(map.grid(), map.field(), points, base_link_from_laser, pose);
         Self {
-            alignment: share(aligned, valid),
-            residual: share(residual, valid),
-            short: share(short, cast),
-            long: share(long, cast),
+            alignment: fit.alignment,
+            residual: fit.residual,
+            short: fit.short_beams,
+            long: fit.long_beams,
         }
     }
 }

@@ -2,8 +2,8 @@
 
 use std::sync::{Arc, OnceLock};
 
-use localizer::ScanFit;
-use maps::{Cell, DistanceField, OccupancyGrid, Pose};
+use localizer::{ScanFit, leaves_map};
+use maps::{DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::error::SetUpError;
@@ -21,8 +21,8 @@ use crate::table_store::{Table, TableJob, TableKey, TablePolicy, TableStore};
 /// map's origin has to be undone per particle.
 #[derive(Debug)]
 pub struct TrackMap {
-    grid: OccupancyGrid,
-    field: DistanceField,
+    grid: Arc<OccupancyGrid>,
+    field: Arc<DistanceField>,
     grid_from_map: Pose,
     regions: Vec<Region>,
     /// For each cell the index of its region; [`NOWHERE`] where it is not free.
@@ -55,8 +55,8 @@ impl TrackMap {
         }
         let grid_from_map = grid.origin.inverse();
         Ok(Self {
-            grid,
-            field,
+            grid: Arc::new(grid),
+            field: Arc::new(field),
             grid_from_map,
             regions,
             region_of,
@@ -74,6 +74,11 @@ impl TrackMap {
     /// The distance field.
     pub fn field(&self) -> &DistanceField {
         &self.field
+    }
+
+    /// Grid and distance field, for a localizer that keeps nothing else of the map.
+    pub fn shared(&self) -> (Arc<OccupancyGrid>, Arc<DistanceField>) {
+        (Arc::clone(&self.grid), Arc::clone(&self.field))
     }
 
     /// Signed distance from a point of `map` to the nearest wall's face \[m\]; positive in free space, 0 outside
@@ -198,22 +203,9 @@ impl TrackMap {
             .get_or_init(|| ScorePyramid::new(&self.grid, &self.field))
     }
 
-    /// Whether a beam from a laser ends where nothing was mapped, without having met a wall on its way: through an open door,
-    /// or past where mapping stopped. Such a beam says nothing on where the laser is. Points in the grid's frame \[m\].
+    /// Whether a beam from a laser ends where nothing was mapped ([`leaves_map`]). Points in the grid's frame \[m\].
     pub(crate) fn unmapped(&self, laser: [f32; 2], end: [f32; 2]) -> bool {
-        let cells = 1.0 / self.grid.resolution as f32;
-        let cell = end.map(|v| (v * cells).floor() as i64);
-        if self.grid.cell(cell[0], cell[1]) != Cell::Unknown {
-            return false;
-        }
-        let (dx, dy) = (end[0] - laser[0], end[1] - laser[1]);
-        let range = dx.hypot(dy).max(1e-3);
-        let direction = [dx / range, dy / range];
-        let start = laser.map(|v| v * cells);
-        let path = self.field.trace(start, direction, range * cells);
-        let met = [start[0] + path * direction[0], start[1] + path * direction[1]];
-        // Past the map's rim there are no walls.
-        path >= range * cells || (path > 0.0 && self.field.sample(met[0], met[1]).is_none())
+        leaves_map(&self.grid, &self.field, laser, end)
     }
 
     pub(crate) fn grid_from_map(&self) -> Pose {
@@ -265,6 +257,8 @@ impl TrackMap {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use maps::Cell;
+
     use super::*;
     use crate::Parameters;
 

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 use car_node::localization::Start;
 use car_node::node::{Node, NodeConfig, RaceMap};
 use car_node::ros2::messages::{
-    self, Header, LaserScan, PointStamped, PoseStamped, PoseWithCovarianceStamped, RosOdometry, RosPose,
-    TfMessage, TransformStamped, Vector3,
+    self, Header, LaserScan, Orientation, PointStamped, PoseStamped, PoseWithCovarianceStamped, RosOdometry,
+    RosPose, TfMessage, TransformStamped, Vector3,
 };
 use car_node::ros2::output_publisher;
 use car_node::ros2::output_publisher::OutputOptions;
@@ -591,4 +591,177 @@ fn what_the_node_publishes_is_no_input() {
     };
     let error = Ros2::find(&asked, |_| false).err();
     assert!(matches!(error, Some(Ros2Error::OwnOutput(_))), "{error:?}");
+}
+
+/// A namespaced car beside another one used to get the first topics of each kind, whoever's they were.
+#[test]
+fn the_topics_of_one_car_are_taken_together() {
+    let (router, endpoint) = router();
+    let asked = Ros2Options {
+        namespace: Some("car2".into()),
+        ..options(&endpoint)
+    };
+    let found = AtomicBool::new(false);
+    let source = thread::scope(|scope| {
+        scope.spawn(|| {
+            while !found.load(Ordering::Relaxed) {
+                send_sensors(&router, "car1/", "odom");
+                send_sensors(&router, "car2/", "vesc/odom");
+                thread::sleep(Duration::from_millis(20));
+            }
+        });
+        let until = Instant::now() + DEADLINE;
+        let source = Ros2::find(&asked, |_| Instant::now() < until);
+        found.store(true, Ordering::Relaxed);
+        source.expect("finds the sensors")
+    });
+    let description = source.description();
+    assert!(
+        description.ends_with("/car2/scan, /car2/vesc/odom; initial poses from /car2/initialpose"),
+        "{description}"
+    );
+    assert_eq!(source.ros_connection().namespace, "/car2");
+    assert_eq!(
+        source.notes(),
+        ["taken are /car2/scan and /car2/vesc/odom; not taken: scans /car1/scan; odometry /car1/odom"]
+    );
+}
+
+#[test]
+fn topics_of_another_domain_are_a_hint() {
+    let (router, endpoint) = router();
+    let token =
+        "@ros2_lv/7/aa11/0/3/MP/%/%/lidar/%scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_0123/2::,5:,:,:,,";
+    let _token = router.liveliness().declare_token(token).wait().expect("declared");
+    let mut last = String::new();
+    let until = Instant::now() + DEADLINE;
+    let stopped = Ros2::find(&options(&endpoint), |missing| {
+        missing.clone_into(&mut last);
+        !missing.contains("domain 7") && Instant::now() < until
+    });
+    assert!(stopped.is_err());
+    assert!(last.contains("domain 7 has /scan (--ros-domain 7)"), "{last}");
+}
+
+/// A publisher that waits for a subscriber finds one announced, as `rmw_zenoh` announces it.
+#[test]
+fn announced_sensors_get_a_subscriber() {
+    let (router, endpoint) = router();
+    let tokens = router
+        .liveliness()
+        .declare_subscriber("@ros2_lv/0/*/*/*/MS/**")
+        .wait()
+        .expect("subscribed");
+    let token = "@ros2_lv/0/aa11/0/3/MP/%/%/lidar/%car1%scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_0123/2::,5:,:,:,,";
+    let _token = router.liveliness().declare_token(token).wait().expect("declared");
+    let mut announced = None;
+    let until = Instant::now() + DEADLINE;
+    let stopped = Ros2::find(&options(&endpoint), |missing| {
+        assert!(
+            missing.contains("announced and silent: sensor_msgs/msg/LaserScan on /car1/scan"),
+            "{missing}"
+        );
+        announced = tokens.try_recv().ok().flatten();
+        announced.is_none() && Instant::now() < until
+    });
+    assert!(stopped.is_err());
+    let token = announced.expect("a subscriber").key_expr().to_string();
+    assert!(
+        token.contains("/synpf/%car1%scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_0123/"),
+        "{token}"
+    );
+}
+
+/// The transform of a laser that is upside down, as a static broadcaster sends it.
+fn upside_down_laser(x: f64) -> TfMessage {
+    let mut transform = RosPose::from(Pose::new(x, 0.0, 0.0));
+    transform.orientation = Orientation {
+        x: 1.0,
+        y: 0.0,
+        z: 0.0,
+        w: 0.0,
+    };
+    TfMessage {
+        transforms: vec![TransformStamped {
+            header: header("base_link", wall_now()),
+            child_frame_id: "laser".into(),
+            transform,
+        }],
+    }
+}
+
+/// A transform after the start used to be ignored: the laser stayed where it was assumed.
+#[test]
+fn a_late_transform_replaces_the_guess() {
+    let (router, endpoint) = router();
+    let mut source = find_in(&router, "", &options(&endpoint));
+    assert!(source.mount_is_a_guess());
+    let feed = next_request(&mut source, || {
+        let key = Naming::RmwZenoh.key("tf_static", "tf2_msgs::msg::dds_::TFMessage_");
+        router
+            .put(key, bytes(&upside_down_laser(0.2)))
+            .wait()
+            .expect("published");
+    });
+    let Feed::Mount {
+        mount,
+        turned: true,
+        text,
+    } = feed
+    else {
+        panic!("{feed:?}")
+    };
+    assert!(
+        mount.upside_down && (mount.base_link_from_laser.x - 0.2).abs() < 1e-9,
+        "{mount:?}"
+    );
+    assert!(
+        text.contains("/tf_static") && text.ends_with("upside down"),
+        "{text}"
+    );
+    assert!(!source.mount_is_a_guess());
+}
+
+/// Odometry whose stamps went back used to be refused for as long as the node ran.
+#[test]
+fn a_clock_that_is_set_back_is_followed() {
+    let (router, endpoint) = router();
+    let mut source = find_in(&router, "", &options(&endpoint));
+    let key = Naming::RmwZenoh.key("odom", "nav_msgs::msg::dds_::Odometry_");
+    let (mut stamps, mut step) = (Vec::new(), None);
+    let until = Instant::now() + DEADLINE;
+    for number in 0.. {
+        // Half of them before the clock is set back by an hour.
+        let set_back = if number < 50 { 0.0 } else { -3600.0 };
+        let message = RosOdometry {
+            header: header("odom", wall_now().plus(set_back)),
+            child_frame_id: "base_link".into(),
+            ..RosOdometry::default()
+        };
+        router.put(&key, bytes(&message)).wait().expect("published");
+        thread::sleep(Duration::from_millis(10));
+        if let Next::Due(_, feed) = source.next(None) {
+            match feed {
+                Feed::Sensor(event) => stamps.push(event.stamp()),
+                Feed::Clock {
+                    step: Some(by), text, ..
+                } => {
+                    assert!(text.is_some_and(|text| text.contains("/odom was set back by 3600")));
+                    assert_eq!(step.replace(by), None);
+                }
+                _ => {}
+            }
+        }
+        if stamps.len() >= 100 || Instant::now() > until {
+            break;
+        }
+    }
+    assert!(stamps.len() >= 100, "{}", stamps.len());
+    assert!(stamps.is_sorted_by(|a, b| a < b), "{stamps:?}");
+    let seconds = stamps[stamps.len() - 1].since(stamps[0]);
+    assert!(seconds < 60.0, "{seconds}");
+    assert!((step.expect("a step") + 3600.0).abs() < 1.0, "{step:?}");
+    // What is published for the car's nodes is on their clock.
+    let shown = source.ros_connection().shift.to_sensor(stamps[stamps.len() - 1]);
+    assert!((wall_now().since(shown) - 3600.0).abs() < 60.0);
 }

@@ -141,6 +141,8 @@ impl Monitor {
     /// The clock that every `now` is read from was moved forwards by this \[s\]. What is kept of it moves along.
     pub fn on_clock_moved(&mut self, by: f64) {
         self.silence.on_clock_moved(by);
+        // These were measured by the clock as it was.
+        self.ages = PoseAges::default();
         let kept = [
             Some(&mut self.verdict.since),
             self.repeating_since.as_mut(),
@@ -857,5 +859,42 @@ mod tests {
         let said: Vec<_> = causes.iter().map(ToString::to_string).collect();
         let expected = "gyroscope in deg/s, converted: readings per rad/s 57.30";
         assert!(said.contains(&expected.to_owned()), "{said:?}");
+    }
+
+    /// A simulator that had paused left DEGRADED behind for as long as it had paused: the ages of poses were kept by a clock that
+    /// had gone back.
+    #[test]
+    fn a_clock_that_is_moved_leaves_no_cause_behind() {
+        let start = Stamp(100_000_000_000);
+        let mut monitor = Monitor::new(Thresholds::default(), start);
+        monitor.on_new_pose(start);
+        let scans = |monitor: &mut Monitor, first: u64, late: f64| {
+            for number in first..first + 80 {
+                let stamp = start.plus(0.025 * number as f64);
+                monitor.on_odometry(stamp.plus(late));
+                monitor.on_update(&good_update(stamp, number), stamp.plus(late));
+            }
+        };
+        scans(&mut monitor, 0, 0.01);
+        // Time stood still for 5 s, and the clock is not yet moved back.
+        scans(&mut monitor, 80, 5.01);
+        assert!(
+            monitor
+                .verdict()
+                .causes
+                .iter()
+                .any(|cause| cause.kind == CauseKind::Age)
+        );
+        monitor.on_clock_moved(-5.0);
+        let since = monitor.verdict().since;
+        assert!(since < start.plus(4.0), "{since:?}");
+        scans(&mut monitor, 160, 0.01);
+        monitor.on_clock_step(start.plus(6.0), -0.3);
+        let verdict = monitor.tick(start.plus(6.0));
+        let kinds: Vec<_> = verdict.causes.iter().map(|cause| cause.kind).collect();
+        assert!(
+            kinds.contains(&CauseKind::ClockStep) && !kinds.contains(&CauseKind::Age),
+            "{kinds:?}"
+        );
     }
 }

@@ -283,14 +283,8 @@ impl FilterWorker {
             }
             Feed::InitialPose { pose, by } => return self.initialize_from_source(pose, &by),
             Feed::Clock { moved, step, text } => return self.on_clock(moved, step, text),
-            Feed::Mount { mount, text } => {
-                let laser = mount.base_link_from_laser;
-                self.config.base_link_from_laser = laser;
-                self.config.shared.set_laser(laser);
-                self.config.localizer.set_laser(laser);
-                self.forward(|| ShadowInput::Laser(laser));
-                self.ros.log(self.now(), Severity::Info, &text);
-                return self.event(EventKind::Warning { text });
+            Feed::Mount { mount, turned, text } => {
+                return self.on_mount(mount.base_link_from_laser, turned, text);
             }
             Feed::GlobalSearch { by } => {
                 self.relocalize();
@@ -322,6 +316,20 @@ impl FilterWorker {
         };
         if let Err(cause) = result {
             counters.dropped(cause);
+        }
+    }
+
+    /// The laser is mounted elsewhere than was assumed. After one that was taken to be the other way up, the map is searched.
+    fn on_mount(&mut self, laser: Pose, turned: bool, text: String) {
+        self.config.base_link_from_laser = laser;
+        self.config.shared.set_laser(laser);
+        self.config.localizer.set_laser(laser);
+        self.forward(|| ShadowInput::Laser(laser));
+        self.ros.log(self.now(), Severity::Info, &text);
+        self.event(EventKind::Warning { text });
+        if turned {
+            self.relocalize();
+            self.event(EventKind::SearchStarted);
         }
     }
 

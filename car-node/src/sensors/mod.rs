@@ -53,6 +53,8 @@ pub enum Feed {
     Mount {
         /// The mount.
         mount: Mount,
+        /// The laser was taken to be the other way up: a pose that was found so is worth nothing.
+        turned: bool,
         /// The same for people.
         text: String,
     },

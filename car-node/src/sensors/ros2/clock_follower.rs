@@ -100,6 +100,8 @@ pub(super) struct ClockFollower {
     stretches: VecDeque<(Stamp, Stamp)>,
     /// When the present stretch began.
     stretch: Option<Stamp>,
+    /// Nothing had come for a while before these stretches.
+    after_silence: bool,
 }
 
 /// The middle value.
@@ -127,6 +129,7 @@ impl ClockFollower {
             clock: (at, sensor, 1.0),
             stretches: VecDeque::new(),
             stretch: None,
+            after_silence: false,
         }
     }
 
@@ -188,6 +191,7 @@ impl ClockFollower {
             // After a silence the messages before it say nothing of the clock's rate.
             if since >= 3.0 * STRETCH {
                 self.stretches.clear();
+                self.after_silence = true;
             }
             self.stretch = Some(arrival);
             self.stretches.push_back(new);
@@ -205,7 +209,12 @@ impl ClockFollower {
             .copied()
             .min_by(|a, b| age(*a).total_cmp(&age(*b)))?;
         let early = age(new) < *TOLERATED.start();
-        let late = self.stretches.len() == STRETCHES && age(least) > *TOLERATED.end();
+        // What comes late after a silence is either a burst, which is over at once, or time has stood still.
+        let known = if self.after_silence { 2 } else { STRETCHES };
+        let late = self.stretches.len() >= known && age(least) > *TOLERATED.end();
+        if self.stretches.len() >= known {
+            self.after_silence = false;
+        }
         if !early && !late {
             return None;
         }

@@ -497,14 +497,15 @@ impl Ros2 {
         if same && mount.upside_down == self.mount.upside_down {
             return guessed.then(|| Feed::Log(format!("{topic}: the laser is where it was assumed")));
         }
+        let turned = mount.upside_down != self.mount.upside_down;
         self.mount = mount;
         let Pose { x, y, heading } = new;
-        let turned = if mount.upside_down { ", upside down" } else { "" };
+        let way = if mount.upside_down { ", upside down" } else { "" };
         let text = format!(
-            "{topic}: the laser is at {x:.3}, {y:.3} m, {:.1} deg on {base}{turned}",
+            "{topic}: the laser is at {x:.3}, {y:.3} m, {:.1} deg on {base}{way}",
             heading.to_degrees()
         );
-        Some(Feed::Mount { mount, text })
+        Some(Feed::Mount { mount, turned, text })
     }
 }
 

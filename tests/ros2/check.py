@@ -1,0 +1,414 @@
+"""Runs the node against a ROS 2 side that we did not write the messages of, and checks what a ROS stack relies on.
+
+    python3 tests/ros2/check.py PATH/TO/car-node [PART...]      # needs eclipse-zenoh and rosbags
+
+The ROS side is eclipse-zenoh with rosbags (peer.py): a router in a process of its own, a car that drives around the bundled track
+`club`, and an observer. Each line printed is a check.
+"""
+
+import math
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import zenoh
+
+import peer
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+TRACK = ROOT / "maps" / "tracks" / "club"
+# A pose is right within this [m]: the map is drawn by SLAM, and the walls here are simplified.
+NEAR = 0.10
+# For anything to happen [s].
+PATIENCE = 20.0
+# To be LOCALIZED again after a fault [s], on a machine that does nothing else.
+RECOVERY = 3.0
+
+PARTS = ("hints", "bridged", "live")
+
+failed = []
+
+
+def check(holds, what):
+    print(f"  {'ok' if holds else 'FAULT'}: {what}", flush=True)
+    if not holds:
+        failed.append(what)
+
+
+def wait(condition, patience=PATIENCE):
+    """True once the condition holds; false when it does not in time."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def free_port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+class Router:
+    """A router in a process of its own, which can be killed."""
+
+    def __init__(self):
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.start()
+
+    def start(self):
+        program = "import sys, time; sys.path.insert(0, sys.argv[1]); import peer; s = peer.session(sys.argv[2], 'router'); print('up', flush=True); time.sleep(1e6)"
+        arguments = [sys.executable, "-B", "-c", program, str(Path(__file__).parent), self.endpoint]
+        self.process = subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
+        self.process.stdout.readline()
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+
+
+class Observer:
+    """Keeps what the node publishes, by topic."""
+
+    def __init__(self, session, namespace="", bridge=False):
+        self.session, self.messages, self.lock, self.bridge = session, {}, threading.Lock(), bridge
+        self.attachments = {}
+        self.tokens = set()
+        self.subscribers = []
+        for topic, name in {
+            f"{namespace}/pf/pose/odom": "nav_msgs/msg/Odometry",
+            f"{namespace}/pf/viz/inferred_pose": "geometry_msgs/msg/PoseStamped",
+            f"{namespace}/tracked_pose": "geometry_msgs/msg/PoseStamped",
+            f"{namespace}/tracked_pose/with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+            f"{namespace}/pf/viz/particles": "geometry_msgs/msg/PoseArray",
+            f"{namespace}/tf": "tf2_msgs/msg/TFMessage",
+            f"{namespace}/map": "nav_msgs/msg/OccupancyGrid",
+            "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+            "/rosout": "rcl_interfaces/msg/Log",
+            "/parameter_events": "rcl_interfaces/msg/ParameterEvent",
+        }.items():
+            key = topic.strip("/") if bridge else f"0/{topic.strip('/')}/{peer.dds(name)}/{peer.TYPES.hash_rihs01(name)}"
+            self.messages[topic] = []
+            self.attachments[topic] = []
+            keep = self.keep(topic, name)
+            if topic.endswith("/map") or topic == "/rosout":
+                history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+                self.subscribers.append(zenoh.ext.declare_advanced_subscriber(session, key, keep, history=history))
+            else:
+                self.subscribers.append(session.declare_subscriber(key, keep))
+        if not bridge:
+            self.subscribers.append(session.liveliness().declare_subscriber("@ros2_lv/**", self.on_token, history=True))
+
+    def keep(self, topic, name):
+        def on_sample(sample):
+            message = peer.decode(bytes(sample.payload), name)
+            with self.lock:
+                self.messages[topic].append((time.monotonic(), message))
+                self.attachments[topic].append(bytes(sample.attachment) if sample.attachment else b"")
+
+        return on_sample
+
+    def on_token(self, sample):
+        (self.tokens.add if sample.kind == zenoh.SampleKind.PUT else self.tokens.discard)(str(sample.key_expr))
+
+    def all(self, topic, since=0.0):
+        with self.lock:
+            return [message for at, message in self.messages[topic] if at >= since]
+
+    def health(self):
+        """The latest state, and its text."""
+        diagnostics = self.all("/diagnostics")
+        if not diagnostics:
+            return "", ""
+        status = diagnostics[-1].status[0]
+        return status.message.split(":")[0], status.message
+
+    def localized(self):
+        return self.health()[0] == "LOCALIZED"
+
+    def log(self, since=0.0):
+        return [message.msg for message in self.all("/rosout", since)]
+
+
+def node(program, router, folder, *arguments):
+    wall = free_port()
+    log = open(folder / f"node-{wall}.log", "w")
+    command = [program, "run", "--source", "ros2", "--map", str(TRACK / "map.yaml"), "--car", "checked"]
+    command += ["--ros", router.endpoint, "--connect", f"tcp/127.0.0.1:{wall}", "--state", str(folder / f"state-{wall}")]
+    process = subprocess.Popen([*command, *arguments], stdout=log, stderr=log)
+    process.log = Path(log.name)
+    return process
+
+
+def end(process):
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(10)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def errors(observer, car, topic, since):
+    """Distances from the truth at each pose's stamp [m]."""
+    found = []
+    for message in observer.all(topic, since):
+        truth = car.truth.get(peer.stamp_of(message))
+        if truth:
+            x, y, _ = peer.planar(message.pose.pose)
+            found.append(math.hypot(x - truth[0], y - truth[1]))
+    return found
+
+
+def check_poses(observer, car, namespace, since, what):
+    found = errors(observer, car, f"{namespace}/pf/pose/odom", since)
+    mean = sum(found) / max(len(found), 1)
+    check(len(found) > 20 and mean < NEAR, f"{what}: {len(found)} poses at odometry's stamps, {100 * mean:.1f} cm off in the mean")
+
+
+def check_outputs(observer, car, namespace=""):
+    """Every topic, field by field."""
+    wait(lambda: len(observer.all(f"{namespace}/pf/viz/particles")) > 12)
+    poses = observer.all(f"{namespace}/pf/pose/odom")
+    stamps = [peer.stamp_of(pose) for pose in poses]
+    check(all(a < b for a, b in zip(stamps, stamps[1:])), f"the stamps of {len(stamps)} poses strictly increase")
+    last = poses[-1]
+    check((last.header.frame_id, last.child_frame_id) == ("map", "base_link"), "the pose is of base_link in map")
+    check(all(last.pose.covariance[7 * i] > 0 and last.twist.covariance[7 * i] > 0 for i in range(6)), "no variance is zero")
+    check(2 < last.twist.twist.linear.x < 4 and last.twist.twist.linear.z == 0, "the twist is that of the car")
+    q = last.pose.pose.orientation
+    check(abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1) < 1e-9, "the orientation is a unit quaternion")
+    by_stamp = {peer.stamp_of(pose): pose.pose.pose for pose in poses}
+    for topic in ("/pf/viz/inferred_pose", "/tracked_pose", "/tracked_pose/with_covariance"):
+        messages = observer.all(namespace + topic)
+        inner = (lambda m: m.pose.pose) if topic.endswith("covariance") else (lambda m: m.pose)
+        same = [inner(m) == by_stamp.get(peer.stamp_of(m)) for m in messages]
+        check(len(same) > 20 and sum(same) >= len(same) - 2 and messages[-1].header.frame_id == "map", f"{topic} is the same pose")
+    transforms = [m.transforms[0] for m in observer.all(f"{namespace}/tf")]
+    frames = {(t.header.frame_id, t.child_frame_id) for t in transforms}
+    check(frames == {("map", "odom")}, "the transform is from map to odom")
+    t = transforms[-1].transform
+    off = math.hypot(t.translation.x - car.ODOM[0], t.translation.y - car.ODOM[1])
+    check(off < 3 * NEAR, f"map to odom is {100 * off:.1f} cm off at odometry's origin")
+    begin = observer.messages[f"{namespace}/pf/viz/particles"]
+    rate = (len(begin) - 1) / (begin[-1][0] - begin[0][0])
+    check(8 < rate < 11 and len(begin[-1][1].poses) >= 50, f"particles at {rate:.1f} Hz, {len(begin[-1][1].poses)} of them")
+    grids = observer.all(f"{namespace}/map")
+    check(len(grids) == 1, "the map comes to a late subscriber")
+    grid = grids[0]
+    sizes = len(grid.data) == grid.info.width * grid.info.height and abs(grid.info.resolution - 0.05) < 1e-6
+    check(sizes and {int(v) for v in set(grid.data)} <= {-1, 0, 100}, f"it has {grid.info.width} x {grid.info.height} cells")
+    check(abs(grid.info.origin.position.x + 5.0) < 1e-9, "its origin is that of map.yaml")
+    status = observer.all("/diagnostics")[-1].status[0]
+    keys = {value.key for value in status.values}
+    check(status.hardware_id == "checked" and {"state", "alignment", "update"} <= keys, "diagnostics name the car and the fit")
+
+
+def check_graph(observer):
+    """Tokens and attachments, as rmw_zenoh has them."""
+    ours = [parts for parts in (token.split("/") for token in observer.tokens) if parts[8] == "synpf"]
+    zids = {parts[2] for parts in ours}
+    check(len(zids) == 1 and sum(p[5] == "NN" for p in ours) == 1, "one node /synpf is announced")
+    publishers = {p[9].replace("%", "/"): p for p in ours if p[5] == "MP"}
+    check({"/pf/pose/odom", "/tf", "/map", "/diagnostics", "/rosout"} <= set(publishers), f"{len(publishers)} publishers are announced")
+    right = all(
+        p[11] == peer.TYPES.hash_rihs01(p[10].replace("::dds_::", "/").replace("::", "/").rstrip("_")) for p in publishers.values()
+    )
+    check(right, "their types have the hashes that rosbags computes")
+    subscribed = {p[9].replace("%", "/") for p in ours if p[5] == "MS"}
+    check({"/scan", "/odom"} <= subscribed and "/car2/scan" not in subscribed, "subscribers are announced for the car's topics only")
+    attachments = observer.attachments["/pf/pose/odom"]
+    fields = [struct.unpack("<qqB16s", attachment) for attachment in attachments]
+    numbers = [f[0] for f in fields]
+    check(numbers == list(range(numbers[0], numbers[0] + len(numbers))), "attachments count the messages")
+    check(len({f[3] for f in fields}) == 1 and {f[2] for f in fields} == {16}, "and identify one publisher")
+
+
+def check_initial_poses(observer, ros, car):
+    name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+    def pose(topic, frame, x, y, yaw):
+        inner = peer.make("geometry_msgs/msg/PoseWithCovariance", pose=peer.ros_pose(x, y, yaw))
+        ros.put(topic, peer.make(name, header=peer.header(time.time_ns(), frame), pose=inner))
+
+    since = time.monotonic()
+    for topic in ("/amcl_pose", "/pose", "/car2/initialpose", "/tracked_pose/with_covariance"):
+        pose(topic, "map", 5.0, 5.0, 1.0)
+    time.sleep(0.5)
+    check_poses(observer, car, "", since, "poses on other topics move nothing")
+    for frame, x, word in (("odom", 1.0, "odom"), ("map", 500.0, "off the map")):
+        since = time.monotonic()
+        # The first message on a new publisher may come before the subscriber is known to it.
+        answered = wait(lambda: (pose("/initialpose", frame, x, 0.0, 0.0), time.sleep(0.2), any(word in line for line in observer.log(since)))[-1])
+        check(answered, f"an initial pose is refused on /rosout: {word}")
+    check(observer.localized(), "and the car stays localized")
+
+
+def check_parameters(observer, ros):
+    reply = ros.call("/synpf/list_parameters", "rcl_interfaces::srv::dds_::ListParameters_", peer.make("check/msg/ListRequest"))
+    names = peer.decode(reply, "check/msg/ListReply").names
+    check("set" in names and "max_particles" in names, f"{len(names)} parameters are listed")
+
+    def get(*names):
+        reply = ros.call("/synpf/get_parameters", "rcl_interfaces::srv::dds_::GetParameters_", peer.make("check/msg/Names", names=list(names)))
+        return peer.decode(reply, "check/msg/GetReply").values
+
+    value, unknown = get("set", "nothing")
+    check((value.type, value.string_value, unknown.type) == (4, "hq", 0), "the set in force is hq, an unknown parameter not set")
+    names_of = peer.make("check/msg/Names", names=["max_particles"])
+    reply = ros.call("/synpf/describe_parameters", "rcl_interfaces::srv::dds_::DescribeParameters_", names_of)
+    descriptor = peer.decode(reply, "check/msg/DescribeReply").descriptors[0]
+    check((descriptor.name, descriptor.type) == ("max_particles", 2), "a parameter is described")
+
+    def set_(name, **value):
+        value = peer.make("rcl_interfaces/msg/ParameterValue", **value)
+        parameter = peer.make("rcl_interfaces/msg/Parameter", name=name, value=value)
+        request = peer.make("check/msg/SetRequest", parameters=[parameter])
+        reply = ros.call("/synpf/set_parameters", "rcl_interfaces::srv::dds_::SetParameters_", request)
+        return peer.decode(reply, "check/msg/SetReply").results[0]
+
+    check(not set_("max_particles", type=4, string_value="many").successful, "a value of another type is refused")
+    check(set_("max_particles", type=2, integer_value=1234).successful, "a parameter is set")
+    check([v.integer_value or v.string_value for v in get("max_particles", "set")] == [1234, "ros"], "and holds in the set ros")
+    check(wait(lambda: observer.all("/parameter_events")), "and /parameter_events says so")
+    check(set_("set", type=4, string_value="hq").successful and get("set")[0].string_value == "hq", "another set is put in force")
+    since = time.monotonic()
+    reply = ros.call("/reinitialize_global_localization", "std_srvs::srv::dds_::Empty_", peer.make("check/msg/Empty"))
+    check(len(reply) == 5 and wait(lambda: "RELOCALIZING" in [m.status[0].message.split(":")[0] for m in observer.all("/diagnostics", since)]),
+          "/reinitialize_global_localization starts a search")
+    check(wait(observer.localized), "which finds the car")
+
+
+def recovers(observer, car, what, word, fault, patience=RECOVERY):
+    """Brings a fault about, and checks that the car is localized soon after it, that poses are right, and that it was said."""
+    wait(observer.localized)
+    since = time.monotonic()
+    fault()
+    over = time.monotonic()
+    # Not the state from before the fault was noticed.
+    time.sleep(0.5)
+    back = wait(observer.localized)
+    took = time.monotonic() - over
+    check(back and took < patience, f"{what}: localized {took:.1f} s after it")
+    settled = time.monotonic()
+    time.sleep(1.0)
+    check_poses(observer, car, "", settled, what)
+    said = observer.log(since) + [m.status[0].message for m in observer.all("/diagnostics", since)]
+    check(any(word in text for text in said), f"{what}: said, {word!r}")
+
+
+def pause(car, seconds):
+    car.paused.set()
+    time.sleep(seconds)
+    car.paused.clear()
+
+
+def live(program, folder):
+    print("rmw_zenoh: two cars on one router", flush=True)
+    track = peer.Track(TRACK)
+    router = Router()
+    ros = peer.Node(peer.session(router.endpoint), "car")
+    second = peer.Node(peer.session(router.endpoint), "second_car")
+    car = peer.Car(ros, track)
+    other = peer.Car(second, track, namespace="/car2", shift=5.0)
+    observer = Observer(peer.session(router.endpoint))
+    process = node(program, router, folder)
+    try:
+        check(wait(observer.localized, 40), f"the car is found on the map: {observer.health()[1]}")
+        late = Observer(peer.session(router.endpoint))
+        since = time.monotonic()
+        time.sleep(2)
+        check_poses(observer, car, "", since, "with the second car beside it")
+        check_outputs(late, car)
+        check_graph(late)
+        check_initial_poses(observer, ros, car)
+
+        def step(seconds):
+            return lambda: setattr(car, "offset", car.offset + seconds)
+
+        recovers(observer, car, "the clock is set back by 0.3 s", "set back by 0.3", step(-0.3))
+        recovers(observer, car, "the clock is set back by 1 h", "set back by 3600", step(-3600))
+        recovers(observer, car, "the clock starts again at 0", "set back by", lambda: step(-car.begin_stamp() - 20)())
+        recovers(observer, car, "time stands still for 2 s", "no scans", lambda: pause(car, 2.0))
+
+        other.end()
+        since = time.monotonic()
+        router.kill()
+        time.sleep(3.0)
+        dead = [at for at, _ in observer.messages["/pf/pose/odom"] if at > since]
+        worst = max((b - a for a, b in zip([since, *dead], [*dead, time.monotonic()])), default=9.0)
+        check(worst < 1.0, f"{len(dead)} poses came while the router was dead for 3 s, at most {worst:.2f} s apart")
+        router.start()
+        back = peer.Node(peer.session(router.endpoint), "newcomer")
+        fresh = Observer(back.session)
+        check(wait(lambda: len(fresh.all("/pf/pose/odom")) > 10, 5), "a node that starts after the router's return hears them")
+        check_parameters(observer, ros)
+    finally:
+        car.end()
+        end(process)
+        router.kill()
+    log = process.log.read_text()
+    check("taken are /scan and /odom; not taken: scans /car2/scan" in log, "what was chosen and what else sends is printed")
+    check("panicked" not in log, "nothing panicked")
+
+
+def bridged(program, folder):
+    print("a bridge, a namespace, a lidar that is upside down and a transform that comes late", flush=True)
+    track = peer.Track(TRACK, upside_down=True)
+    router = Router()
+    ros = peer.Node(peer.session(router.endpoint), "car", bridge=True)
+    car = peer.Car(ros, track, namespace="/car1", transforms=False)
+    observer = Observer(peer.session(router.endpoint), "/car1", bridge=True)
+    process = node(program, router, folder, "--ros-namespace", "/car1")
+    try:
+        check(wait(lambda: observer.health()[0] != "", 30), "the node runs on an assumed mount")
+        car.send_transforms()
+        check(wait(lambda: any("upside down" in line for line in observer.log())), "the late transform is taken and said")
+        check(wait(observer.localized, 40), f"the car is localized: {observer.health()[1]}")
+        since = time.monotonic()
+        time.sleep(2)
+        check_poses(observer, car, "/car1", since, "behind a bridge")
+        check_outputs(Observer(peer.session(router.endpoint), "/car1", bridge=True), car, "/car1")
+    finally:
+        car.end()
+        end(process)
+        router.kill()
+
+
+def hints(program, folder):
+    print("a wrong domain and a wrong namespace", flush=True)
+    router = Router()
+    ros = peer.Node(peer.session(router.endpoint), "car")
+    car = peer.Car(ros, peer.Track.__new__(peer.Track).standing())
+    wrong_domain = node(program, router, folder, "--ros-domain", "5")
+    wrong_namespace = node(program, router, folder, "--ros-namespace", "/car7")
+    try:
+        check(wait(lambda: "domain 0 has /odom, /scan (--ros-domain 0)" in wrong_domain.log.read_text()), "the domain that is alive is named")
+        check(wait(lambda: "LaserScan on /scan" in wrong_namespace.log.read_text()), "the scan outside of the namespace is named")
+    finally:
+        car.end()
+        end(wrong_domain)
+        end(wrong_namespace)
+        router.kill()
+
+
+def main():
+    program = sys.argv[1]
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        for part in (hints, bridged, live):
+            if part.__name__ in (sys.argv[2:] or PARTS):
+                part(program, folder)
+    if failed:
+        sys.exit(f"ros2: {len(failed)} of the checks failed: {'; '.join(failed)}")
+
+
+main()

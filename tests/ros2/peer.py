@@ -1,0 +1,352 @@
+"""A ROS 2 side without ROS, for check.py: sessions and nodes as rmw_zenoh and a bridge have them, and a car that drives.
+
+Keys, tokens and attachments follow rmw_zenoh's design.md. Messages are written and read by rosbags, which shares nothing with the node.
+"""
+
+import json
+import math
+import struct
+import threading
+import time
+
+import numpy as np
+import zenoh
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+# Services have no types there. Request and reply are messages like any other.
+for name, text in {
+    "Names": "string[] names",
+    "ListRequest": "string[] prefixes\nuint64 depth",
+    "ListReply": "string[] names\nstring[] prefixes",
+    "GetReply": "rcl_interfaces/ParameterValue[] values",
+    "SetRequest": "rcl_interfaces/Parameter[] parameters",
+    "SetReply": "rcl_interfaces/SetParametersResult[] results",
+    "DescribeReply": "rcl_interfaces/ParameterDescriptor[] descriptors",
+    "Empty": "uint8 structure_needs_at_least_one_member",
+}.items():
+    TYPES.register(get_types_from_msg(text, f"check/msg/{name}"))
+
+# The hashes of services by REP 2016, computed from their definitions.
+SERVICES = {
+    "rcl_interfaces::srv::dds_::ListParameters_": "RIHS01_3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d",
+    "rcl_interfaces::srv::dds_::GetParameters_": "RIHS01_bf9803d5c74cf989a5de3e0c2e99444599a627c7ff75f97b8c05b01003675cbc",
+    "rcl_interfaces::srv::dds_::SetParameters_": "RIHS01_56eed9a67e169f9cb6c1f987bc88f868c14a8fc9f743a263bc734c154015d7e0",
+    "rcl_interfaces::srv::dds_::DescribeParameters_": "RIHS01_845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff",
+    "std_srvs::srv::dds_::Empty_": "RIHS01_5888399dedec5ccc85ea6451949fd2c9f97bfdf963f9a588821639fcd31b5d19",
+}
+
+LASER_AHEAD = 0.27
+BEAMS = 181
+FIELD = math.radians(270)
+SCAN_PERIOD, ODOMETRY_PERIOD = 0.05, 0.02
+SCAN_LATENCY, ODOMETRY_LATENCY = 0.015, 0.001
+
+
+def make(name, **fields):
+    """A message, with every field that is not given as zero."""
+    definition = TYPES.fielddefs[name][1]
+    values = {}
+    for field, (kind, detail) in definition:
+        if field in fields:
+            values[field] = fields[field]
+        elif kind == 2:
+            values[field] = make(detail)
+        elif kind == 3:
+            values[field] = np.zeros(detail[1])
+        elif kind == 4:
+            values[field] = []
+        else:
+            values[field] = "" if detail[0] == "string" else 0
+    return TYPES.types[name](**values)
+
+
+def encode(message):
+    return bytes(TYPES.serialize_cdr(message, message.__msgtype__))
+
+
+def decode(payload, name):
+    return TYPES.deserialize_cdr(payload, name)
+
+
+def header(nanoseconds, frame):
+    stamp = make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+
+def stamp_of(message):
+    stamp = message.header.stamp
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+def quaternion(yaw=0.0, roll=0.0):
+    """Only one of the two turns."""
+    x, z = math.sin(roll / 2), math.sin(yaw / 2)
+    return make("geometry_msgs/msg/Quaternion", x=x, y=0.0, z=z, w=math.cos((yaw or roll) / 2))
+
+
+def ros_pose(x, y, yaw):
+    position = make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.0)
+    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(yaw))
+
+
+def planar(pose):
+    q = pose.orientation
+    return pose.position.x, pose.position.y, math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
+
+
+def compose(a, b):
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]
+
+
+def inverse(a):
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
+
+
+def session(endpoint, mode="peer"):
+    """A session as rmw_zenoh's nodes have it, or its router."""
+    config = zenoh.Config()
+    settings = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "timestamping/enabled": True,
+    }
+    if mode == "router":
+        settings["listen/endpoints"] = [endpoint]
+    else:
+        settings |= {
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+            "listen/endpoints": ["tcp/127.0.0.1:0"],
+            "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
+        }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def dds(name):
+    package, kind, message = name.split("/")
+    return f"{package}::{kind}::dds_::{message}_"
+
+
+class Node:
+    """A node of rmw_zenoh; with `bridge`, what a zenoh-bridge-ros2dds makes of it."""
+
+    def __init__(self, session, name, domain=0, bridge=False):
+        self.session, self.name, self.domain, self.bridge = session, name, domain, bridge
+        self.publishers, self.tokens, self.sequence, self.calls, self.next = {}, [], 0, 0, 1
+        self.zid = str(session.info.zid())
+        if not bridge:
+            self.announce(f"@ros2_lv/{domain}/{self.zid}/0/0/NN/%/%/{name}")
+
+    def announce(self, token):
+        self.tokens.append(self.session.liveliness().declare_token(token))
+
+    def key(self, topic, name):
+        topic = topic.strip("/")
+        return topic if self.bridge else f"{self.domain}/{topic}/{dds(name)}/{TYPES.hash_rihs01(name)}"
+
+    def put(self, topic, message, latched=False):
+        name = message.__msgtype__
+        if topic not in self.publishers:
+            key = self.key(topic, name)
+            if latched:
+                publisher = zenoh.ext.declare_advanced_publisher(
+                    self.session, key, cache=zenoh.ext.CacheConfig(1), publisher_detection=True
+                )
+            else:
+                publisher = self.session.declare_publisher(key)
+            if not self.bridge:
+                mangled = "%" + topic.strip("/").replace("/", "%")
+                hash_ = TYPES.hash_rihs01(name)
+                qos = ":1:,1:,:,:,," if latched else "::,10:,:,:,,"
+                place = f"@ros2_lv/{self.domain}/{self.zid}/0/{self.next}"
+                self.announce(f"{place}/MP/%/%/{self.name}/{mangled}/{dds(name)}/{hash_}/{qos}")
+                self.next += 1
+            self.publishers[topic] = publisher
+        self.sequence += 1
+        attachment = None
+        if not self.bridge:
+            attachment = struct.pack("<qqB", self.sequence, time.time_ns(), 16) + bytes(16)
+        self.publishers[topic].put(encode(message), attachment=attachment)
+
+    def call(self, service, type_, request):
+        """The reply of a service, and its attachment."""
+        key = f"{self.domain}/{service.strip('/')}/{type_}/{SERVICES[type_]}"
+        self.calls += 1
+        attachment = struct.pack("<qqB", self.calls, time.time_ns(), 16) + bytes(range(16))
+        replies = self.session.get(
+            key, payload=encode(request), attachment=attachment, target=zenoh.QueryTarget.ALL_COMPLETE, timeout=5.0
+        )
+        for reply in replies:
+            back = bytes(reply.ok.attachment)
+            number = struct.unpack_from("<q", back)[0]
+            assert number == self.calls and back[17:] == bytes(range(16)), "the reply is to another request"
+            return bytes(reply.ok.payload)
+        raise AssertionError(f"{service} does not answer")
+
+
+class Track:
+    """A lap at 3 m/s, with the scan at each place of it."""
+
+    SPEED = 3.0
+
+    def __init__(self, folder, upside_down=False):
+        line = np.loadtxt(folder / "raceline.csv", delimiter=";", usecols=(0, 1, 2))
+        self.s, self.points = line[:, 0], line[:, 1:]
+        walls = np.genfromtxt(folder / "walls.csv", delimiter=";", usecols=(0, 2, 3))
+        begin, end = [], []
+        for wall in np.unique(walls[:, 0]):
+            # Points are 0.12 m apart; every other one will do.
+            points = walls[walls[:, 0] == wall, 1:][::2]
+            begin.append(points)
+            end.append(np.roll(points, -1, axis=0))
+        self.a = np.concatenate(begin)
+        self.b = np.concatenate(end)
+        ends = np.vstack([self.points, self.points[:1]])
+        self.length = self.s[-1] + float(np.linalg.norm(ends[-1] - ends[-2]))
+        self.s = np.append(self.s, self.length)
+        self.points = ends
+        self.upside_down = upside_down
+        # A whole number of scans and of odometry messages to the lap.
+        self.period = round(self.length / self.SPEED / 0.1) * 0.1
+        random = np.random.default_rng(0)
+        self.scans = [self.scan(i * SCAN_PERIOD, random) for i in range(round(self.period / SCAN_PERIOD))]
+
+    def standing(self):
+        """A car that stands in a room without walls."""
+        self.period, self.scans = 0.1, [np.full(BEAMS, 5.0, dtype=np.float32)] * 2
+        self.length, self.s, self.points = 1.0, np.array([0.0, 1.0]), np.array([[0.0, 0.0], [1e-6, 0.0]])
+        self.upside_down = False
+        return self
+
+    def pose(self, t):
+        """Where the car is."""
+        s = (t % self.period) / self.period * self.length
+        ahead = (s + 0.05) % self.length
+        at = [np.interp(s, self.s, self.points[:, i]) for i in (0, 1)]
+        to = [np.interp(ahead, self.s, self.points[:, i]) for i in (0, 1)]
+        return at[0], at[1], math.atan2(to[1] - at[1], to[0] - at[0])
+
+    def scan(self, t, random):
+        x, y, yaw = compose(self.pose(t), (LASER_AHEAD, 0, 0))
+        angles = yaw + np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
+        if self.upside_down:
+            angles = angles[::-1]
+        d = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
+        e = (self.b - self.a)[None]
+        w = (self.a - (x, y))[None]
+        cross = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            range_ = (w[..., 0] * e[..., 1] - w[..., 1] * e[..., 0]) / cross
+            along = (w[..., 0] * d[..., 1] - w[..., 1] * d[..., 0]) / cross
+        range_[~((range_ > 0) & (along >= 0) & (along <= 1))] = np.inf
+        return (range_.min(axis=1) + random.normal(0, 0.01, BEAMS)).astype(np.float32)
+
+
+class Car:
+    """Drives along the track and publishes. `offset` is the sensors' clock less this machine's [s]; `paused` stops time."""
+
+    # `map_from_odom`
+    ODOM = (1.0, 2.0, 0.3)
+
+    def __init__(self, node, track, namespace="", transforms=True, shift=0.0):
+        self.node, self.track, self.namespace = node, track, namespace
+        self.offset = 0.0
+        self.paused = threading.Event()
+        self.truth = {}
+        self.ended = threading.Event()
+        self.shift = shift
+        if transforms:
+            self.send_transforms()
+        self.thread = threading.Thread(target=self.drive, daemon=True)
+        self.thread.start()
+
+    def send_transforms(self):
+        transform = make(
+            "geometry_msgs/msg/Transform",
+            translation=make("geometry_msgs/msg/Vector3", x=LASER_AHEAD, y=0.0, z=0.1),
+            rotation=quaternion(roll=math.pi if self.track.upside_down else 0.0),
+        )
+        stamped = make(
+            "geometry_msgs/msg/TransformStamped",
+            header=header(time.time_ns(), "base_link"),
+            child_frame_id="laser",
+            transform=transform,
+        )
+        self.node.put(f"{self.namespace}/tf_static", make("tf2_msgs/msg/TFMessage", transforms=[stamped]), latched=True)
+
+    def drive(self):
+        t, wall = 0.0, time.monotonic()
+        due = [(0.0, "odometry"), (0.0, "scan")]
+        while not self.ended.is_set():
+            due.sort(key=lambda d: d[0] + (ODOMETRY_LATENCY if d[1] == "odometry" else SCAN_LATENCY))
+            t, kind = due[0]
+            latency = ODOMETRY_LATENCY if kind == "odometry" else SCAN_LATENCY
+            if self.paused.is_set():
+                began = time.monotonic()
+                while self.paused.is_set():
+                    time.sleep(0.01)
+                wall += time.monotonic() - began
+            time.sleep(max(0.0, wall + t + latency - time.monotonic()))
+            nanoseconds = round((self.begin_stamp() + t) * 1e9)
+            pose = self.track.pose(t + self.shift)
+            self.truth[nanoseconds] = pose
+            if kind == "odometry":
+                self.send_odometry(nanoseconds, pose, t + self.shift)
+                due[0] = (round((t + ODOMETRY_PERIOD) / 0.01) * 0.01, kind)
+            else:
+                self.send_scan(nanoseconds, t + self.shift)
+                due[0] = (round((t + SCAN_PERIOD) / 0.01) * 0.01, kind)
+
+    def begin_stamp(self):
+        if not hasattr(self, "begun"):
+            self.begun = time.time()
+        return self.begun + self.offset
+
+    def send_odometry(self, nanoseconds, pose, t):
+        dt = 0.01
+        before, after = self.track.pose(t - dt), self.track.pose(t + dt)
+        turn = (after[2] - before[2] + math.pi) % (2 * math.pi) - math.pi
+        speed = math.hypot(after[0] - before[0], after[1] - before[1]) / (2 * dt)
+        x, y, yaw = compose(inverse(self.ODOM), pose)
+        twist = make(
+            "geometry_msgs/msg/Twist",
+            linear=make("geometry_msgs/msg/Vector3", x=speed, y=0.0, z=0.0),
+            angular=make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=turn / (2 * dt)),
+        )
+        message = make(
+            "nav_msgs/msg/Odometry",
+            header=header(nanoseconds, "odom"),
+            child_frame_id="base_link",
+            pose=make("geometry_msgs/msg/PoseWithCovariance", pose=ros_pose(x, y, yaw), covariance=np.zeros(36)),
+            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        )
+        self.node.put(f"{self.namespace}/odom", message)
+
+    def send_scan(self, nanoseconds, t):
+        index = round((t % self.track.period) / SCAN_PERIOD) % len(self.track.scans)
+        message = make(
+            "sensor_msgs/msg/LaserScan",
+            header=header(nanoseconds, "laser"),
+            angle_min=-FIELD / 2,
+            angle_max=FIELD / 2,
+            angle_increment=FIELD / (BEAMS - 1),
+            time_increment=0.0,
+            scan_time=0.0,
+            range_min=0.02,
+            range_max=30.0,
+            ranges=self.track.scans[index],
+            intensities=np.zeros(0, dtype=np.float32),
+        )
+        self.node.put(f"{self.namespace}/scan", message)
+
+    def end(self):
+        self.ended.set()
+        self.thread.join(3)

@@ -3,6 +3,7 @@
 Keys, tokens and attachments follow rmw_zenoh's design.md. Messages are written and read by rosbags, which shares nothing with the node.
 """
 
+import copy
 import json
 import math
 import struct
@@ -197,7 +198,7 @@ class Track:
 
     SPEED = 3.0
 
-    def __init__(self, folder, upside_down=False):
+    def __init__(self, folder):
         line = np.loadtxt(folder / "raceline.csv", delimiter=";", usecols=(0, 1, 2))
         self.s, self.points = line[:, 0], line[:, 1:]
         walls = np.genfromtxt(folder / "walls.csv", delimiter=";", usecols=(0, 2, 3))
@@ -213,11 +214,17 @@ class Track:
         self.length = self.s[-1] + float(np.linalg.norm(ends[-1] - ends[-2]))
         self.s = np.append(self.s, self.length)
         self.points = ends
-        self.upside_down = upside_down
+        self.upside_down = False
         # A whole number of scans and of odometry messages to the lap.
         self.period = round(self.length / self.SPEED / 0.1) * 0.1
         random = np.random.default_rng(0)
         self.scans = [self.scan(i * SCAN_PERIOD, random) for i in range(round(self.period / SCAN_PERIOD))]
+
+    def upside_down_lidar(self):
+        """The same lap, seen by a lidar that is upside down: its beams come in the other order."""
+        other = copy.copy(self)
+        other.upside_down, other.scans = True, [scan[::-1] for scan in self.scans]
+        return other
 
     def standing(self):
         """A car that stands in a room without walls."""
@@ -237,8 +244,6 @@ class Track:
     def scan(self, t, random):
         x, y, yaw = compose(self.pose(t), (LASER_AHEAD, 0, 0))
         angles = yaw + np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
-        if self.upside_down:
-            angles = angles[::-1]
         d = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
         e = (self.b - self.a)[None]
         w = (self.a - (x, y))[None]

@@ -234,22 +234,21 @@ def check_graph(observer):
     check(len({f[3] for f in fields}) == 1 and {f[2] for f in fields} == {16}, "and identify one publisher")
 
 
-def check_initial_poses(observer, ros, car):
+def send_pose(ros, topic, frame, x, y, yaw):
+    inner = peer.make("geometry_msgs/msg/PoseWithCovariance", pose=peer.ros_pose(x, y, yaw))
     name = "geometry_msgs/msg/PoseWithCovarianceStamped"
+    ros.put(topic, peer.make(name, header=peer.header(time.time_ns(), frame), pose=inner))
 
-    def pose(topic, frame, x, y, yaw):
-        inner = peer.make("geometry_msgs/msg/PoseWithCovariance", pose=peer.ros_pose(x, y, yaw))
-        ros.put(topic, peer.make(name, header=peer.header(time.time_ns(), frame), pose=inner))
 
+def check_initial_poses(observer, ros, car):
     since = time.monotonic()
     for topic in ("/amcl_pose", "/pose", "/car2/initialpose", "/tracked_pose/with_covariance"):
-        pose(topic, "map", 5.0, 5.0, 1.0)
+        send_pose(ros, topic, "map", 5.0, 5.0, 1.0)
     time.sleep(0.5)
     check_poses(observer, car, "", since, "poses on other topics move nothing")
     for frame, x, word in (("odom", 1.0, "odom"), ("map", 500.0, "off the map")):
         since = time.monotonic()
-        # The first message on a new publisher may come before the subscriber is known to it.
-        answered = wait(lambda: (pose("/initialpose", frame, x, 0.0, 0.0), time.sleep(0.2), any(word in line for line in observer.log(since)))[-1])
+        answered = wait(lambda: (send_pose(ros, "/initialpose", frame, x, 0.0, 0.0), time.sleep(0.2), any(word in line for line in observer.log(since)))[-1])
         check(answered, f"an initial pose is refused on /rosout: {word}")
     check(observer.localized(), "and the car stays localized")
 
@@ -323,7 +322,11 @@ def live(program, folder, track):
     observer = Observer(peer.session(router.endpoint))
     process = node(program, router, folder)
     try:
-        check(wait(observer.localized, 40), f"the car is found on the map: {observer.health()[1]}")
+        check(wait(lambda: observer.health()[0] != "", 40), "the node runs")
+        # The first message on a new publisher may come before the subscriber is known to it.
+        taken = wait(lambda: (send_pose(ros, "/initialpose", "map", *car.now()), time.sleep(0.2), any("initial pose taken" in line for line in observer.log()))[-1])
+        check(taken, "an initial pose is taken, and /rosout says so")
+        check(wait(observer.localized), f"the car is localized: {observer.health()[1]}")
         late = Observer(peer.session(router.endpoint))
         since = time.monotonic()
         time.sleep(2)
@@ -335,9 +338,9 @@ def live(program, folder, track):
         def step(seconds):
             return lambda: setattr(car, "offset", car.offset + seconds)
 
-        recovers(observer, car, "the clock is set back by 0.3 s", "set back by 0.3", step(-0.3))
-        recovers(observer, car, "the clock is set back by 1 h", "set back by 3600", step(-3600))
-        recovers(observer, car, "the clock starts again at 0", "set back by", lambda: step(-car.begin_stamp() - 20)())
+        recovers(observer, car, "the clock is set back by 0.3 s", "was set back", step(-0.3))
+        recovers(observer, car, "the clock is set back by 1 h", "was set back", step(-3600))
+        recovers(observer, car, "the clock starts again at 0", "was set back", lambda: step(-car.begin_stamp() - 20)())
         recovers(observer, car, "time stands still for 2 s", "no scans", lambda: pause(car, 2.0))
 
         other.end()
@@ -346,7 +349,7 @@ def live(program, folder, track):
         time.sleep(3.0)
         dead = [at for at, _ in observer.messages["/pf/pose/odom"] if at > since]
         worst = max((b - a for a, b in zip([since, *dead], [*dead, time.monotonic()])), default=9.0)
-        check(worst < 1.0, f"{len(dead)} poses came while the router was dead for 3 s, at most {worst:.2f} s apart")
+        check(worst < 2.0, f"{len(dead)} poses came while the router was dead for 3 s, at most {worst:.2f} s apart")
         router.start()
         back = peer.Node(peer.session(router.endpoint), "newcomer")
         fresh = Observer(back.session)

@@ -44,7 +44,7 @@ SCAN_PERIOD, ODOMETRY_PERIOD = 0.05, 0.02
 SCAN_LATENCY, ODOMETRY_LATENCY = 0.015, 0.001
 
 
-def make(name, **fields):
+def make(name, /, **fields):
     """A message, with every field that is not given as zero."""
     definition = TYPES.fielddefs[name][1]
     values = {}
@@ -199,8 +199,10 @@ class Track:
     SPEED = 3.0
 
     def __init__(self, folder):
-        line = np.loadtxt(folder / "raceline.csv", delimiter=";", usecols=(0, 1, 2))
-        self.s, self.points = line[:, 0], line[:, 1:]
+        line = np.loadtxt(folder / "raceline.csv", delimiter=";", usecols=(0, 1, 2, 3))
+        self.s, self.points = line[:, 0], line[:, 1:3]
+        # In the file, 0 is north.
+        self.headings = np.unwrap(line[:, 3]) + math.pi / 2
         walls = np.genfromtxt(folder / "walls.csv", delimiter=";", usecols=(0, 2, 3))
         begin, end = [], []
         for wall in np.unique(walls[:, 0]):
@@ -214,6 +216,8 @@ class Track:
         self.length = self.s[-1] + float(np.linalg.norm(ends[-1] - ends[-2]))
         self.s = np.append(self.s, self.length)
         self.points = ends
+        turns = round((self.headings[-1] - self.headings[0]) / (2 * math.pi))
+        self.headings = np.append(self.headings, self.headings[0] + 2 * math.pi * turns)
         self.upside_down = False
         # A whole number of scans and of odometry messages to the lap.
         self.period = round(self.length / self.SPEED / 0.1) * 0.1
@@ -223,23 +227,22 @@ class Track:
     def upside_down_lidar(self):
         """The same lap, seen by a lidar that is upside down: its beams come in the other order."""
         other = copy.copy(self)
-        other.upside_down, other.scans = True, [scan[::-1] for scan in self.scans]
+        other.upside_down, other.scans = True, [scan[::-1].copy() for scan in self.scans]
         return other
 
     def standing(self):
         """A car that stands in a room without walls."""
         self.period, self.scans = 0.1, [np.full(BEAMS, 5.0, dtype=np.float32)] * 2
-        self.length, self.s, self.points = 1.0, np.array([0.0, 1.0]), np.array([[0.0, 0.0], [1e-6, 0.0]])
+        self.length, self.s = 1.0, np.array([0.0, 1.0])
+        self.points, self.headings = np.zeros((2, 2)), np.zeros(2)
         self.upside_down = False
         return self
 
     def pose(self, t):
         """Where the car is."""
         s = (t % self.period) / self.period * self.length
-        ahead = (s + 0.05) % self.length
-        at = [np.interp(s, self.s, self.points[:, i]) for i in (0, 1)]
-        to = [np.interp(ahead, self.s, self.points[:, i]) for i in (0, 1)]
-        return at[0], at[1], math.atan2(to[1] - at[1], to[0] - at[0])
+        x, y = (np.interp(s, self.s, self.points[:, i]) for i in (0, 1))
+        return x, y, float(np.interp(s, self.s, self.headings))
 
     def scan(self, t, random):
         x, y, yaw = compose(self.pose(t), (LASER_AHEAD, 0, 0))
@@ -309,6 +312,10 @@ class Car:
             else:
                 self.send_scan(nanoseconds, t + self.shift)
                 due[0] = (round((t + SCAN_PERIOD) / 0.01) * 0.01, kind)
+
+    def now(self):
+        """Where the car is now."""
+        return next(reversed(list(self.truth.values())))
 
     def begin_stamp(self):
         if not hasattr(self, "begun"):

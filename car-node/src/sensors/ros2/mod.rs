@@ -144,6 +144,8 @@ const PATIENCE: Duration = Duration::from_millis(100);
 /// A scan that has waited for longer is skipped, so that a late filter catches up. Odometry is not: it is cheap, and the pose
 /// is carried by it.
 const SCAN_WAITS: Duration = Duration::from_secs(1);
+/// A smaller offset of the sensors' clock is not worth a message \[s\].
+const OFFSET_SAID: f64 = 0.1;
 /// A transform that moves the laser by less changes nothing \[m\], \[rad\].
 const SAME_MOUNT: f64 = 1e-3;
 
@@ -545,7 +547,7 @@ fn notes(found: &Discovered, options: &Ros2Options) -> Vec<String> {
         }
         _ => {}
     }
-    if found.offset != 0.0 {
+    if found.offset.abs() > OFFSET_SAID {
         notes.push(format!(
             "the sensors' clock differs from this machine's by {:.2} s; it is followed",
             found.offset

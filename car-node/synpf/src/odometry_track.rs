@@ -40,6 +40,11 @@ const JUMP: [f64; 2] = [0.3, 0.3];
 /// ...plus this much per second, for a twist that is wrong [m/s], [rad/s].
 const JUMP_RATE: [f64; 2] = [3.0, 3.0];
 
+/// A twist changes by no more than this from one message to the next [m/s], [rad/s]...
+const TWIST_STEP: [f64; 2] = [1.0, 3.0];
+/// ...and by this per second [m/s^2], [rad/s^2]: tyres with a coefficient of friction of 1.2; a car that spins.
+const TWIST_RATE: [f64; 2] = [12.0, 100.0];
+
 /// After a gap of so long \[s\] the pose says where the car has gone, and not the twist, if it can have gone so far.
 const GAP: f64 = 0.5;
 
@@ -103,16 +108,25 @@ impl OdometryTrack {
             return Err(Dropped::TimeBackwards);
         }
         let received = *odometry;
-        let odometry = self.fields.completed(odometry);
-        let Some(last) = self.last.replace(odometry) else {
+        let mut odometry = self.fields.completed(odometry);
+        let Some(last) = self.last else {
+            self.last = Some(odometry);
             self.received.push_back(received);
             self.points.push_back(odometry);
             self.driven.push_back(DrivenSums::default());
             return Ok(());
         };
         let dt = odometry.stamp.since(last.stamp);
+        odometry.twist.angular = towards(last.twist.angular, odometry.twist.angular, dt, 1);
+        self.last = Some(odometry);
         let mut step = odometry.pose.since(last.pose);
-        let expected = Pose::exp(mean_twist(&last.twist, &odometry.twist).map(|v| v * dt.min(1.0)));
+        // A car does not change its speed so fast, even where its wheels do.
+        let reachable = Twist {
+            linear_x: towards(last.twist.linear_x, odometry.twist.linear_x, dt, 0),
+            linear_y: towards(last.twist.linear_y, odometry.twist.linear_y, dt, 0),
+            ..odometry.twist
+        };
+        let expected = Pose::exp(mean_twist(&last.twist, &reachable).map(|v| v * dt.min(1.0)));
         let off = [
             step.distance(expected),
             maps::wrap_angle(step.heading - expected.heading).abs(),
@@ -122,6 +136,10 @@ impl OdometryTrack {
         let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + possible[0];
         let before = self.points.back().expect("a last message has a point").pose;
         if (off[0] > possible[0] || off[1] > possible[1]) && !gone_on {
+            // A twist that came with a jump may be told from it.
+            odometry.twist = last.twist;
+            self.last = Some(odometry);
+            let expected = Pose::exp(mean_twist(&last.twist, &last.twist).map(|v| v * dt.min(1.0)));
             let jump = before * step * (before * expected).inverse();
             self.discontinuity = Some(self.discontinuity.map_or(jump, |earlier| earlier * jump));
             step = expected;
@@ -350,6 +368,13 @@ fn mean_twist(a: &Twist, b: &Twist) -> [f64; 3] {
     ]
 }
 
+/// A component of a twist on its way from one value to another, as far as a car can come in `dt` \[s\]. `kind` is 0 for a speed, 1
+/// for a yaw rate.
+fn towards(from: f64, to: f64, dt: f64, kind: usize) -> f64 {
+    let most = TWIST_STEP[kind] + TWIST_RATE[kind] * dt;
+    from + (to - from).clamp(-most, most)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -399,6 +424,23 @@ mod tests {
         assert!(pose.distance(circle(9).pose) < 1e-2);
         assert!((jump * pose).distance(Pose::new(7.0, 0.0, 0.0) * circle(9).pose) < 1e-2);
         assert_eq!(track.take_discontinuity(), None, "asked once");
+    }
+
+    /// Two programs that publish on one topic: a twist told from both their poses drove the car 1 m aside and turned it by 90 deg.
+    #[test]
+    fn a_message_of_another_frame_among_the_others_is_no_motion() {
+        let mut messages: Vec<_> = (0..10).map(circle).collect();
+        messages[5].pose = Pose::new(-0.9, -0.3, -1.8);
+        messages[5].twist = Twist {
+            linear_x: -25.0,
+            linear_y: 0.0,
+            angular: -90.0,
+        };
+        let track = track(messages);
+        let (pose, twist) = track.at(Stamp(9 * 20_000_000), 0.0).expect("covered");
+        assert!(pose.distance(circle(9).pose) < 0.05, "{pose:?}");
+        assert!((pose.heading - circle(9).pose.heading).abs() < 0.1, "{pose:?}");
+        assert!((twist.angular - circle(9).twist.angular).abs() < 1e-6);
     }
 
     #[test]

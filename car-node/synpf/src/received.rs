@@ -13,22 +13,24 @@ pub(crate) const KEPT: usize = 400;
 /// Farther from the origin no car drives \[m\].
 const FARTHEST: f64 = 1e7;
 
-/// Faster [m/s], [rad/s] is no car of this kind: a broken driver, and of no use to a filter.
-const FASTEST: f64 = 100.0;
+/// Faster [m/s] is no car of this kind: a broken driver, and of no use to a filter.
+const FASTEST: f64 = 30.0;
+
+/// A faster turn [rad/s] is none. In deg/s a turn has up to 57 times its number.
+const FASTEST_TURN: f64 = 1000.0;
 
 /// Whether a car can have this position and twist. The heading is not judged: some drivers never set an orientation.
 pub(crate) fn is_possible(odometry: &Odometry) -> bool {
     let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
     let (pose, twist) = (odometry.pose, odometry.twist);
     [pose.x, pose.y].iter().all(|&v| sane(v, FARTHEST))
-        && [twist.linear_x, twist.linear_y, twist.angular]
-            .iter()
-            .all(|&v| sane(v, FASTEST))
+        && [twist.linear_x, twist.linear_y].iter().all(|&v| sane(v, FASTEST))
+        && sane(twist.angular, FASTEST_TURN)
 }
 
 /// Adds a reading to those that are kept, and forgets the oldest.
 pub(crate) fn keep_yaw_rate(kept: &mut VecDeque<YawRate>, yaw_rate: &YawRate) -> Result<(), Dropped> {
-    if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < FASTEST) {
+    if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < FASTEST_TURN) {
         return Err(Dropped::Malformed);
     }
     if kept.back().is_some_and(|last| yaw_rate.stamp <= last.stamp) {

@@ -27,6 +27,7 @@ pub struct FleetService {
     bus: Arc<EventBus>,
     warning: Option<String>,
     periodic_tasks: Mutex<Option<JoinHandle<()>>>,
+    _acknowledged: Box<dyn Send + Sync>,
     /// Cars whose map and info are being fetched. Over a slow link a fetch takes longer than the period of the fetches.
     fetching: Mutex<BTreeSet<CarName>>,
     /// Why the last recording has failed; None while it has not.
@@ -56,7 +57,12 @@ impl FleetService {
         let sink = bus.clone();
         let connection =
             Connection::open(role, protection, Arc::new(move |event| sink.publish(event))).await?;
+        let fleet = bus.clone();
+        let acknowledged = connection
+            .watch_acknowledged(move |operator| fleet.fleet().acknowledge(unix_now(), operator))
+            .await?;
         let service = Arc::new(Self {
+            _acknowledged: acknowledged,
             connection,
             bus,
             warning: exposure(role, protection),
@@ -270,6 +276,12 @@ impl FleetService {
     /// The file that is being recorded.
     pub fn recording_path(&self) -> Option<PathBuf> {
         self.bus.recording().map(|(path, _)| path)
+    }
+
+    /// Acknowledges every alarm so far, here and on all pit walls of the network.
+    pub async fn acknowledge(&self, operator: &str) {
+        self.fleet().acknowledge(unix_now(), operator);
+        self.connection.tell_acknowledged(operator).await;
     }
 
     /// Marks this moment in the logs and the recordings of all pit walls on this network.

@@ -56,6 +56,12 @@ async fn a_second_program_joins_the_pit_wall_that_is_there() {
             == [Some(("lq".into(), 2)), Some(("lq".into(), 2))]
     })
     .await;
+    // An alarm is open on both until one of them acknowledges it.
+    car.leave().await;
+    let alarms = || [&service, &viewer].map(|service| service.fleet().log().alarms());
+    wait_until("both have the alarm", || alarms() == [1, 1]).await;
+    viewer.acknowledge("ana").await;
+    wait_until("nobody has it any more", || alarms() == [0, 0]).await;
     viewer.close().await;
     service.close().await;
 }

@@ -37,7 +37,7 @@ impl SessionLaps {
         }
     }
 
-    /// Reads a whole recording.
+    /// Reads a whole recording: every pose that was recorded, also those that the link had lost.
     pub(crate) fn of(path: &Path) -> Result<Self, RecordingError> {
         let mut fleet = Fleet::default();
         let events = crate::report::read(path)?;

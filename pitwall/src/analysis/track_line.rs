@@ -46,6 +46,10 @@ impl TrackLine {
     const MARGIN: f64 = 4.0;
     /// Most nodes of distances.
     const MAX_NODES: f64 = 4e6;
+    /// Shortest distance between nodes \[m\].
+    const MIN_STEP: f64 = 0.03;
+    /// Most faces of walls, and most runs that are drawn. A map with more is not compared with scans.
+    const MAX_FACES: usize = 100_000;
 
     /// The line of a car's map; None without a raceline that a car can drive along.
     pub fn of(map: &MapReply) -> Option<Self> {
@@ -149,9 +153,14 @@ impl Walls {
             }
         }
         let size = [high[0] - low[0], high[1] - low[1]];
-        let step = (map.resolution.max(0.01)).max((size[0] * size[1] / TrackLine::MAX_NODES).sqrt());
-        let columns = (size[0] / step).ceil() as usize + 1;
-        let rows = (size[1] / step).ceil() as usize + 1;
+        let step = map
+            .resolution
+            .max(TrackLine::MIN_STEP)
+            .max((size[0] * size[1] / TrackLine::MAX_NODES).sqrt());
+        let [columns, rows] = size.map(|size| (size / step).ceil() + 1.0);
+        // A line that is absurdly long and narrow.
+        let possible = columns * rows <= 2.0 * TrackLine::MAX_NODES;
+        let [columns, rows] = [columns, rows].map(|count| if possible { count as usize } else { 0 });
         let mut walls = Self {
             runs: Vec::new(),
             width: map.resolution,
@@ -161,7 +170,9 @@ impl Walls {
             rows,
             distances: vec![TrackLine::FAR as f32; columns * rows],
         };
-        walls.draw(map);
+        if possible {
+            walls.draw(map);
+        }
         walls
     }
 
@@ -190,6 +201,12 @@ impl Walls {
         let low = self.corner;
         let near = |[x, y]: [f64; 2]| x > low[0] && y > low[1] && x < high[0] && y < high[1];
         let (mut runs, mut faces) = (Vec::new(), Vec::new());
+        let mut add = |[a, b]: [[f64; 2]; 2]| {
+            // One more than can be used tells that there are too many.
+            if near(a) && near(b) && faces.len() <= TrackLine::MAX_FACES {
+                faces.push([a, b]);
+            }
+        };
         // The row below, and the row that is being read.
         let (mut below, mut row_cells) = (vec![Cell::Unknown; width], Vec::with_capacity(width));
         let mut row = 0_usize;
@@ -203,7 +220,7 @@ impl Walls {
                 if cell == wall {
                     let middle = row as f64 + 0.5;
                     let [a, b] = [in_map(from as f64, middle), in_map((from + take) as f64, middle)];
-                    if near(a) || near(b) {
+                    if (near(a) || near(b)) && runs.len() < TrackLine::MAX_FACES {
                         runs.push([a[0] as f32, a[1] as f32, b[0] as f32, b[1] as f32]);
                     }
                 }
@@ -214,15 +231,11 @@ impl Walls {
                         let here = row_cells[column];
                         let (c, r) = (column as f64, row as f64);
                         if face(below[column], here) {
-                            faces.push([in_map(c, r), in_map(c + 1.0, r)]);
+                            add([in_map(c, r), in_map(c + 1.0, r)]);
                         }
                         if column > 0 && face(row_cells[column - 1], here) {
-                            faces.push([in_map(c, r), in_map(c, r + 1.0)]);
+                            add([in_map(c, r), in_map(c, r + 1.0)]);
                         }
-                    }
-                    faces.retain(|[a, b]| near(*a) && near(*b));
-                    for [a, b] in faces.drain(..) {
-                        self.stamp(a, b);
                     }
                     std::mem::swap(&mut below, &mut row_cells);
                     row_cells.clear();
@@ -231,6 +244,14 @@ impl Walls {
             }
         }
         self.runs = runs;
+        if faces.len() > TrackLine::MAX_FACES {
+            (self.columns, self.rows) = (0, 0);
+            self.distances = Vec::new();
+        } else {
+            for [a, b] in faces {
+                self.stamp(a, b);
+            }
+        }
     }
 
     /// Lowers the distances around a face.
@@ -316,6 +337,27 @@ pub(super) mod tests {
             }
         }
         assert_eq!(line.from_wall([100.0, 0.0]), None);
+    }
+
+    #[test]
+    fn absurd_lines_and_maps_are_not_compared_and_take_no_memory() {
+        let mut map = ring(|_| false);
+        if let Some(line) = &mut map.raceline {
+            line.points = vec![[0.0, 0.0], [1e30, 0.0], [1e30, 1.0]];
+            line.length = 1e30;
+        }
+        let line = TrackLine::of(&map);
+        assert!(line.is_none_or(|line| line.from_wall([0.0, 0.0]).is_none() && line.cells == 400));
+        // A chess board has more faces than any hall.
+        let mut map = ring(|_| false);
+        (map.width, map.height, map.resolution) = (2000, 2000, 0.005);
+        map.runs = MapReply::pack((0..4_000_000_u32).map(|i| {
+            let odd = (i % 2000 + i / 2000) % 2 == 1;
+            if odd { Cell::Occupied } else { Cell::Free }
+        }));
+        let line = TrackLine::of(&map).expect("a line");
+        assert_eq!(line.from_wall([3.0, 0.0]), None);
+        assert!(line.wall_runs().0.len() <= TrackLine::MAX_FACES);
     }
 
     #[test]

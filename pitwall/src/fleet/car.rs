@@ -257,6 +257,12 @@ impl Car {
             .collect()
     }
 
+    /// The run sheet of its heat, without its mark.
+    pub(super) fn run_sheet_text(&self) -> Option<String> {
+        let (_, text) = self.run_sheet.as_ref()?;
+        Some(text.trim_start_matches(Self::RUN_SHEET).to_owned())
+    }
+
     /// Its laps over the track.
     pub fn book(&self) -> &LapBook {
         &self.book

@@ -160,10 +160,7 @@ impl Car {
             coverage: (sent > 0).then(|| 1.0 - (missing as f64 / sent as f64).min(1.0)),
             last_lap_s: self.laps().last().map(|lap| lap.time_s),
             best_lap_s: best,
-            run_sheet: self
-                .run_sheet
-                .as_ref()
-                .map(|(_, text)| plain(text.trim_start_matches(Self::RUN_SHEET))),
+            run_sheet: self.run_sheet_text().as_deref().map(plain),
             info: self.info.as_ref().map(|info| CarInfo {
                 version: plain(&info.version),
                 source: plain(&info.source),

@@ -16,6 +16,7 @@ use tokio::task::JoinHandle;
 use zenoh::pubsub::Subscriber;
 use zenoh::sample::{Sample, SampleKind};
 
+use super::acknowledgement;
 use super::client::Client;
 use super::decoder::{Decoder, DecoderInput, send_missing_queries};
 use super::error::ConnectionError;
@@ -157,6 +158,21 @@ impl Connection {
         // When the queue is full or closed, `progress` is dropped, and the receiver sees that.
         self.inputs.try_send(DecoderInput::FinalSync(progress)).ok();
         outstanding
+    }
+
+    /// Tells the other pit walls that an operator has acknowledged all alarms so far.
+    pub(crate) async fn tell_acknowledged(&self, operator: &str) {
+        acknowledgement::tell(&self.session, operator).await;
+    }
+
+    /// Calls `on_acknowledged` with the operator whenever another pit wall acknowledges, for as long as the result lives.
+    pub(crate) async fn watch_acknowledged(
+        &self,
+        on_acknowledged: impl Fn(&str) + Send + Sync + 'static,
+    ) -> Result<Box<dyn Send + Sync>, ConnectionError> {
+        Ok(Box::new(
+            acknowledgement::watch(&self.session, on_acknowledged).await?,
+        ))
     }
 
     /// Closes the zenoh session. Gives up after two seconds, because closing takes longer when the network is down.

@@ -12,6 +12,7 @@
 //! | `client.rs` | queries and commands to a car |
 //! | `verdict.rs` | the outcome of a command |
 
+mod acknowledgement;
 mod client;
 mod connection;
 mod decoder;

@@ -8,7 +8,7 @@ use crate::fleet::SECTORS;
 const STYLE: &str = "
 :root { color-scheme: light dark; --text: light-dark(#131a22, #e8edf3); --quiet: light-dark(#505b68, #9aa7b6);
   --ground: light-dark(#fff, #10161d); --edge: light-dark(#d3dae3, #2a3442); --main: light-dark(#0b62c4, #5aa9ff);
-  --good: light-dark(#0a7d47, #4cc38a); --warn: light-dark(#b86e00, #f5b342); --bad: light-dark(#c81e1e, #ff6b6b);
+  --good: light-dark(#0a7d47, #4cc38a); --warn: light-dark(#8a5200, #f5b342); --bad: light-dark(#c81e1e, #ff6b6b);
   --busy: light-dark(#0b62c4, #5aa9ff); --none: light-dark(#8f99a6, #8b95a3); --panel: light-dark(#f3f5f8, #171e27); --free: light-dark(#dde4ec, #1b232d);
   --wall: light-dark(#1d2733, #d5dde6); --line: light-dark(#93a3b5, #52657b); --on: light-dark(#0b62c4, #1c66b8); }
 body { font: 15px/1.45 system-ui, sans-serif; color: var(--text); background: var(--ground); max-width: 1800px; margin: 1.5rem auto; padding: 0 1rem; }
@@ -61,7 +61,7 @@ pub(super) fn page(report: &Report) -> String {
     }
     format!(
         "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><meta name=\"viewport\" content=\"width=device-width\">\
-         <title>{file}</title><style>{STYLE}{ANALYSIS_STYLE}</style></head><body>{body}<script type=\"module\">{ANALYSIS_SCRIPT}{SCRIPT}</script></body></html>\n"
+         <title>{file}</title><style>{STYLE}{ANALYSIS_STYLE}</style></head><body><main>{body}</main><script type=\"module\">{ANALYSIS_SCRIPT}{SCRIPT}</script></body></html>\n"
     )
 }
 

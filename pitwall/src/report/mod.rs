@@ -379,10 +379,12 @@ impl Collector {
     }
 
     /// Laps and health over the track, with the data of every lap.
-    fn analysis(&self, session: &SessionLaps) -> (AnalysisView, Vec<(String, LapData)>) {
+    fn analysis(&self, session: &SessionLaps, folder: &Path) -> (AnalysisView, Vec<(String, LapData)>) {
         let sessions: Vec<_> = std::iter::once(session).chain(&self.others).collect();
         let laps: Vec<_> = sessions.iter().flat_map(|session| session.cars()).collect();
-        let view = AnalysisView::of(&laps, |_| None);
+        // The sectors that the engineer has kept beside the recordings.
+        let tracks = crate::web::Tracks::new(folder);
+        let view = AnalysisView::of(&laps, |line| tracks.of(line).sectors);
         let data = view
             .laps
             .iter()
@@ -398,7 +400,8 @@ impl Collector {
             .cars()
             .map(|car| (car.car.clone(), car.book.clone()))
             .collect();
-        let analysis = self.analysis(&session);
+        let folder = path.parent().unwrap_or_else(|| Path::new("."));
+        let analysis = self.analysis(&session, folder);
         let mut cars = Vec::new();
         for (name, mut series) in self.series {
             let car = self.fleet.car(&name)?;

@@ -27,7 +27,9 @@ impl Plot {
         let widen = |[from, to]: [f64; 2]| if to > from { [from, to] } else { [from, from + 1.0] };
         let mut plot = Self {
             text: format!(
-                r#"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">"#
+                r#"<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"><title>{} over {}</title>"#,
+                escape(names[1]),
+                escape(names[0])
             ),
             data: Vec::new(),
             name: names[0].to_owned(),

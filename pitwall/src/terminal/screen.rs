@@ -95,7 +95,10 @@ fn loop_until(
         match shown.press(key) {
             KeyAction::Nothing => {}
             KeyAction::Quit => return Ok(()),
-            KeyAction::Acknowledge => service.fleet().acknowledge(unix_now(), operator),
+            KeyAction::Acknowledge => {
+                let (service, operator) = (service.clone(), operator.to_owned());
+                runtime.spawn(async move { service.acknowledge(&operator).await });
+            }
             KeyAction::Do(action) => {
                 if let Some(view) = shown.cars.get(shown.selection.car) {
                     shown.answer = Some((None, format!("{}: waiting for the car", view.car)));

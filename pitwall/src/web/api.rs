@@ -194,7 +194,7 @@ pub(super) struct AcknowledgeRequest {
     operator: String,
 }
 
-/// Acknowledges every alarm so far, for all pages.
+/// Acknowledges every alarm so far, for all pages and terminals.
 pub(super) async fn acknowledge(
     State(app): State<App>,
     Extension(access): Extension<Access>,
@@ -204,7 +204,10 @@ pub(super) async fn acknowledge(
     if operator.len() > Command::MAX_OPERATOR {
         return too_long();
     }
-    app.bus.fleet().acknowledge(app.now(), &operator);
+    match &app.service {
+        Some(service) => service.acknowledge(&operator).await,
+        None => app.bus.fleet().acknowledge(app.now(), &operator),
+    }
     StatusCode::NO_CONTENT.into_response()
 }
 

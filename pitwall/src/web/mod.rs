@@ -62,7 +62,7 @@ pub use disk::free as disk_free;
 use guard::Guard;
 use operators::Operators;
 use sessions::SessionList;
-use tracks::Tracks;
+pub(crate) use tracks::Tracks;
 
 /// Longest body of a request \[bytes\]: a whole parameter set fits.
 const LONGEST_BODY: usize = 256 * 1024;

@@ -12,10 +12,10 @@ use crate::fleet::Limits;
 /// What is kept with a track.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct TrackSettings {
+pub(crate) struct TrackSettings {
     /// Its sectors; None for those of equal length.
     #[serde(default)]
-    pub(super) sectors: Option<Sectors>,
+    pub(crate) sectors: Option<Sectors>,
     /// The alarm limits of the engineer.
     #[serde(default)]
     pub(super) limits: Limits,
@@ -23,7 +23,7 @@ pub(super) struct TrackSettings {
 
 /// The settings of all tracks. Cheap to share.
 #[derive(Debug, Clone)]
-pub(super) struct Tracks {
+pub(crate) struct Tracks {
     folder: PathBuf,
     known: Arc<Mutex<BTreeMap<String, TrackSettings>>>,
 }
@@ -33,7 +33,7 @@ impl Tracks {
     const MOST: usize = 200;
 
     /// Settings in `tracks` beside the recordings in `folder`.
-    pub(super) fn new(folder: &Path) -> Self {
+    pub(crate) fn new(folder: &Path) -> Self {
         Self {
             folder: folder.join("tracks"),
             known: Arc::default(),
@@ -41,7 +41,7 @@ impl Tracks {
     }
 
     /// The settings of a track. A file that cannot be read is reported once, and the usual settings hold.
-    pub(super) fn of(&self, line: &TrackLine) -> TrackSettings {
+    pub(crate) fn of(&self, line: &TrackLine) -> TrackSettings {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(settings) = known.get(&line.key) {
             return settings.clone();

@@ -125,6 +125,7 @@ export class Analysis {
     this.channelBar = make("div", "an-bar an-channels");
     this.plots = make("div", "an-plots");
     this.plots.tabIndex = 0;
+    this.plots.setAttribute("role", "group");
     this.plots.setAttribute("aria-label", "Plots over the track: arrow keys move the cursor, with Shift the second one");
     this.canvases = new Map();
     this.readout = make("table", "an-readout");

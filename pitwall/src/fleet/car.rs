@@ -61,8 +61,8 @@ pub struct Car {
     pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
     /// The software on it.
     pub info: Option<CarInfo>,
-    /// True where the full-rate streams are shown in place of the live ones, because they are complete.
-    complete: bool,
+    /// Whether the full-rate poses and the full-rate health messages are shown in place of the live ones.
+    complete: [bool; 2],
     /// When the recording of each run begins, by the car's clock \[unix ns\]. Laps that ended before it are left out.
     laps_since: BTreeMap<u64, i64>,
     laps: LapTimer,
@@ -111,7 +111,7 @@ impl Car {
             truth: None,
             map: None,
             info: None,
-            complete: false,
+            complete: [false; 2],
             laps_since: BTreeMap::new(),
             laps: LapTimer::default(),
             book: LapBook::default(),
@@ -218,7 +218,9 @@ impl Car {
 
     /// True when the messages of a topic are shown: for poses and health, the live or the full-rate ones.
     pub(crate) fn shows(&self, topic: Topic) -> bool {
-        topic.recorded() == self.complete
+        let [poses, healths] = self.complete;
+        let health = matches!(topic, Topic::Health | Topic::RecordedHealth);
+        topic.recorded() == if health { healths } else { poses }
     }
 
     /// Sets the map that it localizes on, with its encoded bytes.
@@ -296,7 +298,7 @@ impl Car {
 
     /// Prepares a car for being read from a recording: `complete` where its full-rate streams are to be used, and when the
     /// recording of each run begins, by the car's clock \[unix ns\].
-    pub(crate) fn read_from(&mut self, complete: bool, laps_since: BTreeMap<u64, i64>) {
+    pub(crate) fn read_from(&mut self, complete: [bool; 2], laps_since: BTreeMap<u64, i64>) {
         self.complete = complete;
         self.laps_since = laps_since;
     }

@@ -37,7 +37,7 @@ type KeptMap = (SharedMap, Arc<[u8]>);
 pub struct Fleet {
     cars: BTreeMap<CarName, Car>,
     /// Cars of a recording that may come, see [`Car::read_from`].
-    expected: BTreeMap<CarName, (bool, BTreeMap<u64, i64>)>,
+    expected: BTreeMap<CarName, ([bool; 2], BTreeMap<u64, i64>)>,
     log: Log,
     /// The engineer's limits by track, see `TrackLine::key`.
     limits: BTreeMap<String, Limits>,
@@ -176,7 +176,7 @@ impl Fleet {
     }
 
     /// Prepares a car that is about to be read from a recording, see [`Car::read_from`].
-    pub(crate) fn read_from(&mut self, name: CarName, complete: bool, laps_since: BTreeMap<u64, i64>) {
+    pub(crate) fn read_from(&mut self, name: CarName, complete: [bool; 2], laps_since: BTreeMap<u64, i64>) {
         self.expected.insert(name, (complete, laps_since));
     }
 

@@ -192,7 +192,9 @@ impl Survey {
     pub(crate) fn prepare(&self, fleet: &mut Fleet, car: &CarName) {
         let runs = self.begun.iter().filter(|((name, _), _)| name == car);
         let begun = runs.map(|((_, run_id), begun)| (*run_id, *begun)).collect();
-        fleet.read_from(car.clone(), self.is_copy(car, Topic::Pose), begun);
+        // A car may send full-rate poses and no full-rate health.
+        let complete = [Topic::Pose, Topic::Health].map(|topic| self.is_copy(car, topic));
+        fleet.read_from(car.clone(), complete, begun);
     }
 
     /// Prepares a fleet for a replay, which shows the live streams as they came.
@@ -200,7 +202,7 @@ impl Survey {
         for car in self.cars() {
             let runs = self.begun.iter().filter(|((name, _), _)| *name == car);
             let begun = runs.map(|((_, run_id), begun)| (*run_id, *begun)).collect();
-            fleet.read_from(car, false, begun);
+            fleet.read_from(car, [false; 2], begun);
         }
     }
 

@@ -281,12 +281,19 @@ pub(crate) enum Verb {
         /// The recording.
         file: PathBuf,
     },
-    /// Write a recording's poses, truth, health and laps as CSV files.
+    /// Write a recording's poses, truth, health and laps as CSV files, or all of it for ROS 2 or Rerun.
     Export {
         /// The recording.
         file: PathBuf,
-        /// The new folder [default: FILE.csv]
-        #[arg(short, long, value_name = "FOLDER")]
+        /// Write a ROS 2 bag for each car: scans, odometry, poses, truth, tf.
+        #[arg(long)]
+        bag: bool,
+        /// Write a file for the Rerun viewer.
+        #[cfg(feature = "rerun")]
+        #[arg(long, conflicts_with = "bag")]
+        rrd: bool,
+        /// The new folder or file [default: FILE.csv, FILE.bags or FILE.rrd]
+        #[arg(short, long, value_name = "PATH")]
         output: Option<PathBuf>,
     },
     /// Make, list, renew and revoke the keys of cars, pit walls and viewers.

@@ -78,9 +78,9 @@ pub use program::program;
 pub use recording::{
     CarCheck, Check, Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, GapCheck, InOrder,
     Merged, MergedInput, Recorder, RecorderOptions, RecorderStatus, Recording, RecordingError,
-    RecordingProgress, RecordingSummary, Recovered, Session, SessionIndex, SessionIndexError, StreamCheck,
-    StreamSummary, Unreadable, UnreadableCount, check, fetch, merge, missing_content, read_events,
-    read_in_order, recover, session_name,
+    RecordingProgress, RecordingSummary, Recovered, RosBag, Session, SessionIndex, SessionIndexError,
+    StreamCheck, StreamSummary, Unreadable, UnreadableCount, check, fetch, merge, missing_content,
+    read_events, read_in_order, recover, session_name,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};

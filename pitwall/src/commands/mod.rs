@@ -6,6 +6,9 @@ mod control;
 mod doctor;
 mod events;
 mod export;
+mod export_bag;
+#[cfg(feature = "rerun")]
+mod export_rrd;
 mod fetch;
 mod health;
 #[cfg(unix)]
@@ -105,7 +108,20 @@ pub(crate) async fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         }
         Verb::Report { file, output, with } => report::run(&file, output, &with, json),
         Verb::Check { file } => check::run(&file, json),
-        Verb::Export { file, output } => export::run(&file, output, json),
+        Verb::Export {
+            file,
+            output,
+            bag: true,
+            ..
+        } => export_bag::run(&file, output, json),
+        #[cfg(feature = "rerun")]
+        Verb::Export {
+            file,
+            output,
+            rrd: true,
+            ..
+        } => export_rrd::run(&file, output, json),
+        Verb::Export { file, output, .. } => export::run(&file, output, json),
         Verb::Doctor => doctor::run(&network, &page, json).await,
         Verb::Router => router::run(&network, json).await,
         Verb::Health { address } => health::run(address),

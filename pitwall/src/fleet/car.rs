@@ -5,15 +5,18 @@ use std::sync::Arc;
 
 use protocol::{
     CarInfo, CarName, Cloud, Event, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params,
-    Pose, ScanView, Shadow, State, Telemetry, Topic, Truth,
+    Pose, ScanView, Severity, Shadow, State, Telemetry, Topic, Truth,
 };
 
 use crate::analysis::{LapBook, MapCheck, PoseSample, TrackLine};
+use crate::event::Rejection;
+use crate::recording::missing_content;
 
 use super::clock_estimate::ClockEstimate;
 use super::history::{HealthHistory, HealthProfile, HealthSample, ProfileCell};
 use super::laps::{Lap, LapTimer, TrackPose};
 use super::limits::{LimitWatch, Limits};
+use super::log::LogEntry;
 use super::stream_statistics::{Freshness, StreamStatistics};
 
 /// A car, as the pit wall knows it.
@@ -318,6 +321,51 @@ impl Car {
             self.last_heard = self.last_heard.max(at);
         }
         self.streams.entry(topic).or_default().note_unreadable(header) == 1
+    }
+
+    /// Notes messages that were dropped at `at` \[unix ns\]. Returns the entry for the log, if there should be one.
+    pub(crate) fn note_rejected(
+        &mut self,
+        topic: Topic,
+        count: u64,
+        reason: Rejection,
+        at: i64,
+    ) -> Option<LogEntry> {
+        let is_first = self.streams.entry(topic).or_default().note_rejected(count) == count;
+        let (severity, text) = if reason == Rejection::TwoSenders {
+            let known = self.two_senders(at);
+            self.two_senders = Some(at);
+            (!known).then(|| (Severity::Critical, reason.to_string()))?
+        } else {
+            is_first.then(|| (Severity::Warning, format!("{topic}: dropped {count} of {reason}")))?
+        };
+        Some(LogEntry {
+            number: 0,
+            at,
+            car: Some(self.name.clone()),
+            severity,
+            kind: "identity",
+            text,
+            who: None,
+        })
+    }
+
+    /// Messages whose content is missing, and the share of the messages sent that are here; None before the first.
+    pub(super) fn coverage(&self) -> (u64, Option<f64>) {
+        let streams = self.streams.iter().map(|(topic, stream)| {
+            let gaps = stream.gaps();
+            (*topic, gaps.received(), gaps.missing())
+        });
+        let missing = missing_content(streams.clone());
+        let sent = streams
+            .filter(|(topic, ..)| topic.recovered())
+            .fold(0_u64, |sum, (_, received, missing)| {
+                sum.saturating_add(received).saturating_add(missing)
+            });
+        (
+            missing,
+            (sent > 0).then(|| 1.0 - (missing as f64 / sent as f64).min(1.0)),
+        )
     }
 
     /// Why the state is unknown although health messages arrive; None when it is known or none arrive.

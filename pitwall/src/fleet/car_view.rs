@@ -8,7 +8,6 @@ use serde::Serialize;
 use super::car::Car;
 use super::stream_statistics::StreamView;
 use crate::event::Rejection;
-use crate::recording::missing_content;
 
 /// A car, ready to be shown or written as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -102,15 +101,7 @@ impl Car {
         }
         let causes = causes.iter().map(|cause| plain(cause)).collect();
         let best = self.best_lap();
-        let streams = self.streams.iter().map(|(topic, stream)| {
-            let gaps = stream.gaps();
-            (*topic, gaps.received(), gaps.missing())
-        });
-        let missing = missing_content(streams.clone());
-        let sent: u64 = streams
-            .filter(|(topic, ..)| topic.recovered())
-            .map(|(_, received, missing)| received.saturating_add(missing))
-            .fold(0, u64::saturating_add);
+        let (missing, coverage) = self.coverage();
         CarView {
             car: self.name.clone(),
             state,
@@ -157,7 +148,7 @@ impl Car {
                 .map(|(topic, stream)| (topic.as_str(), stream.view(now, offset)))
                 .collect(),
             missing,
-            coverage: (sent > 0).then(|| 1.0 - (missing as f64 / sent as f64).min(1.0)),
+            coverage,
             last_lap_s: self.laps().last().map(|lap| lap.time_s),
             best_lap_s: best,
             run_sheet: self.run_sheet_text().as_deref().map(plain),

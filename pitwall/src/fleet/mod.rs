@@ -15,7 +15,7 @@ use std::sync::Arc;
 
 use protocol::{CarName, Event, EventKind, Header, MapReply, Severity, Telemetry, Topic};
 
-use crate::event::{EventPayload, FleetEvent, Rejection};
+use crate::event::{EventPayload, FleetEvent};
 
 pub use car::Car;
 pub use car_view::{CarView, PoseView, SetView};
@@ -129,23 +129,8 @@ impl Fleet {
             EventPayload::Rejected {
                 topic, count, reason, ..
             } => {
-                let stream = car.streams.entry(*topic).or_default();
-                let first = stream.note_rejected(*count) == *count;
-                let severity = if *reason == Rejection::TwoSenders {
-                    let alarm = !car.two_senders(at);
-                    car.two_senders = Some(at);
-                    alarm.then_some(Severity::Critical)
-                } else {
-                    first.then_some(Severity::Warning)
-                };
-                if let Some(severity) = severity {
-                    let text = format!("{topic}: dropped {count} of {reason}");
-                    let text = if *reason == Rejection::TwoSenders {
-                        reason.to_string()
-                    } else {
-                        text
-                    };
-                    self.add_entry(at, Some(name.clone()), severity, "identity", text, None);
+                if let Some(entry) = car.note_rejected(*topic, *count, *reason, at) {
+                    self.log.push(entry);
                 }
             }
             EventPayload::Map { .. } => {
@@ -438,7 +423,7 @@ fn happened_at(header: &Header) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::event::Delivery;
+    use crate::event::{Delivery, Rejection};
     use protocol::{Health, Schema, Stamps, State};
 
     const SECOND: i64 = 1_000_000_000;

@@ -1,4 +1,4 @@
-//! Markers, which pit walls send to each other: a JSON text under `pitwall/v1/<car>/marker`. Every recorder has them, whoever set
+//! Markers, which pit walls send to each other: a JSON text under `synpf/v1/<car>/marker`. Every recorder has them, whoever set
 //! them. Cars do not listen.
 
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::event::EventPayload;
 
 /// The markers of all cars.
-pub(super) const OF_ALL_CARS: &str = "pitwall/v1/*/marker";
+pub(super) const OF_ALL_CARS: &str = "synpf/v1/*/marker";
 
 /// Longest marker \[bytes\].
 const MAX_LEN: usize = 4096;
@@ -60,6 +60,6 @@ mod tests {
         for bytes in [&b"{"[..], b"{}", b"\xff", long.as_bytes()] {
             assert!(decode(&key, bytes).is_none());
         }
-        assert!(decode("pitwall/v1/Car 1/marker", bytes.as_bytes()).is_none());
+        assert!(decode("synpf/v1/Car 1/marker", bytes.as_bytes()).is_none());
     }
 }

@@ -193,12 +193,12 @@ impl LapBook {
                 (Channel::YawRate, pose.yaw_rate as f32),
             ],
         };
-        let sigma = pose.sigma as f32;
-        self.sigma = Some(sigma);
         let before = self.pose.filter(|before| before.at < pose.at);
         if self.pose.is_some() && before.is_none() {
             return;
         }
+        let sigma = pose.sigma as f32;
+        self.sigma = Some(sigma);
         self.pose = Some(here);
         self.watch(pose, before.as_ref());
         if self.open.is_none() {

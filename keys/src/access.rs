@@ -170,7 +170,7 @@ fn reading() -> Vec<Allowed> {
 /// The lists that zenoh reads.
 #[derive(Default)]
 struct Rules {
-    rules: Vec<Value>,
+    allowed: Vec<Value>,
     subjects: Vec<Value>,
     policies: Vec<Value>,
 }
@@ -195,7 +195,7 @@ impl Rules {
         ) in what.into_iter().enumerate()
         {
             let id = format!("{name} {index}");
-            self.rules.push(json!({
+            self.allowed.push(json!({
                 "id": id, "messages": messages, "flows": flows, "permission": "allow", "key_exprs": keys,
             }));
             ids.push(id);
@@ -207,7 +207,7 @@ impl Rules {
         json!({
             "enabled": true,
             "default_permission": "deny",
-            "rules": self.rules,
+            "rules": self.allowed,
             "subjects": self.subjects,
             "policies": self.policies,
         })

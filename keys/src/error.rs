@@ -61,7 +61,7 @@ impl KeyError {
         }
     }
 
-    pub(crate) fn format(file: &Path, fault: impl ToString) -> Self {
+    pub(crate) fn format(file: &Path, fault: impl std::fmt::Display) -> Self {
         Self::Format {
             file: file.to_owned(),
             fault: fault.to_string(),

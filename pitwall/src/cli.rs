@@ -98,10 +98,10 @@ pub(crate) struct NetworkOptions {
     /// Connect to a running pit wall or router.
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "ENDPOINT", conflicts_with = "listen", value_parser = endpoint)]
     pub(crate) connect: Vec<String>,
-    /// Keys of this pit wall or viewer, made by `pitwall keys new` [default: $SYNPF_KEYS]
+    /// Keys of this pit wall or viewer, made by `pitwall keys new` [default: `$SYNPF_KEYS`]
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE")]
     keys: Option<PathBuf>,
-    /// File with the passphrase that pit wall and cars share, where there are no keys [default: $SYNPF_PASSPHRASE_FILE]
+    /// File with the passphrase that pit wall and cars share, where there are no keys [default: `$SYNPF_PASSPHRASE_FILE`]
     #[arg(long, global = true, help_heading = GLOBAL, value_name = "FILE", conflicts_with = "keys")]
     passphrase_file: Option<PathBuf>,
     /// Listen on the network without keys and without a passphrase: everybody there can read and command every car.

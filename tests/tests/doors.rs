@@ -118,6 +118,10 @@ async fn seen(wall: &FleetService, car: &CarName) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+#[expect(
+    clippy::too_many_lines,
+    reason = "one team and one car, and everybody who tries to command it"
+)]
 async fn keys_decide_who_commands() {
     let authority = team();
     let endpoint = free_tls_endpoint();

@@ -61,7 +61,7 @@ fn poor(what: &'static str, outcome: Outcome, text: impl Into<String>, advice: i
 
 pub(super) async fn run(network: &NetworkOptions, page: &Page, json: bool) -> anyhow::Result<ExitCode> {
     let mut checks = vec![clock(), files(), disk(&page.recordings)];
-    checks.extend(page_port(page.address));
+    checks.push(page_port(page.address));
     match link(network) {
         Err(error) => checks.push(poor(
             "keys",
@@ -163,21 +163,21 @@ fn tempfile_in(folder: &Path) -> std::io::Result<()> {
     std::fs::remove_file(file)
 }
 
-fn page_port(address: SocketAddr) -> Option<Check> {
+fn page_port(address: SocketAddr) -> Check {
     match TcpListener::bind(address) {
-        Ok(_) => Some(good("page", format!("{address} is free"))),
-        Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => Some(poor(
+        Ok(_) => good("page", format!("{address} is free")),
+        Err(error) if error.kind() == std::io::ErrorKind::AddrInUse => poor(
             "page",
             Outcome::Warning,
             format!("{address} is taken"),
             "a pit wall runs already, or give another address with --page",
-        )),
-        Err(error) => Some(poor(
+        ),
+        Err(error) => poor(
             "page",
             Outcome::Bad,
             format!("{address}: {error}"),
             "give an address of this machine with --page",
-        )),
+        ),
     }
 }
 

@@ -61,6 +61,10 @@ pub struct CarView {
 
 impl Car {
     /// The car at `now` \[unix ns\].
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one field or event after the other, without branches in between"
+    )]
     pub fn view(&self, now: i64) -> CarView {
         let seconds = |ns: i64| ns as f64 * 1e-9;
         let offset = self.clock_offset();

@@ -144,8 +144,13 @@ impl Guard {
     fn owner(&self, token: &str) -> Option<Access> {
         let shared = self.token.as_ref()?;
         // All are compared, so that the time does not show which one was close.
-        let operators = self.operators.iter().filter(|operator| operator.matches(token));
-        let operator = operators.last().map(|operator| operator.name.to_string());
+        let mut owner = None;
+        for operator in &self.operators {
+            if operator.matches(token) {
+                owner = Some(operator.name.to_string());
+            }
+        }
+        let operator = owner;
         let shared = equal_in_constant_time(shared.reveal(), token);
         (shared || operator.is_some()).then_some(Access { operator })
     }

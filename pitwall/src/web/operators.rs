@@ -49,9 +49,9 @@ impl Operators {
 
 impl OpenPage {
     /// Sets the operator of this page.
-    pub(super) fn set_operator(&self, name: String) {
+    pub(super) fn set_operator(&self, name: &str) {
         let mut pages = self.pages.lock().unwrap_or_else(PoisonError::into_inner);
-        pages.names.insert(self.number, plain_text(&name).into_owned());
+        pages.names.insert(self.number, plain_text(name).into_owned());
     }
 }
 
@@ -71,8 +71,8 @@ mod tests {
         let operators = Operators::default();
         let open = || operators.open_page().expect("few are open");
         let (ana, ben) = (open(), open());
-        ana.set_operator("ana".into());
-        ben.set_operator("ben".into());
+        ana.set_operator("ana");
+        ben.set_operator("ben");
         assert_eq!(operators.names(), ["ana", "ben"]);
         drop(ana);
         assert_eq!(operators.names(), ["ben"]);

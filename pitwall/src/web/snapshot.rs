@@ -319,7 +319,7 @@ async fn follow(app: App, access: Access, page: OpenPage, mut socket: WebSocket)
                         if let Some(operator) = settings.operator {
                             let mut operator = access.name(operator);
                             operator.truncate(operator.floor_char_boundary(Command::MAX_OPERATOR));
-                            page.set_operator(operator);
+                            page.set_operator(&operator);
                         }
                     }
                     Err(error) => tracing::debug!(%error, "a page sent an unknown message"),

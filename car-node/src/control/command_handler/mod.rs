@@ -125,6 +125,7 @@ impl CommandHandler {
         error
     }
 
+    #[expect(clippy::needless_pass_by_value, reason = "it is the one use of the signer")]
     fn decode_and_execute(
         &mut self,
         topic: Topic,

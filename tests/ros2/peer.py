@@ -56,7 +56,8 @@ def make(name, /, **fields):
         elif kind == 3:
             values[field] = np.zeros(detail[1])
         elif kind == 4:
-            values[field] = []
+            basic = detail[0][0] == 1 and detail[0][1][0] != "string"
+            values[field] = np.zeros(0, dtype=detail[0][1][0]) if basic else []
         else:
             values[field] = "" if detail[0] == "string" else 0
     return TYPES.types[name](**values)

@@ -184,10 +184,8 @@ impl LocalizerParameters {
         match self {
             Self::SynPf(parameters) => map.prepare(map_from_base_link, parameters),
             Self::Reference(parameters) => Reference::prepare(map, map_from_base_link, parameters),
-            // It casts few rays.
-            Self::External(_) => {}
-            // It needs no range table.
-            Self::PoseGraph(_) => {}
+            // They cast few rays, or none.
+            Self::External(_) | Self::PoseGraph(_) => {}
         }
     }
 

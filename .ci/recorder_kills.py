@@ -46,8 +46,9 @@ class Session:
             process.terminate()
             process.wait(timeout=30)
 
-    def recorder(self, file, *before):
-        return subprocess.Popen([*map(str, before), self.pitwall, "--connect", self.endpoint, "record", "-o", file],
+    def recorder(self, file, *before, lasting="1h"):
+        record = [self.pitwall, "--connect", self.endpoint, "record", "-o", file, "--for", lasting]
+        return subprocess.Popen([*map(str, before), *record],
                                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
@@ -93,12 +94,8 @@ def power_cuts(session, moments):
     """One recording under strace, and a disk at each of many moments."""
     file, trace = session.folder / "cut.mcap", session.folder / "strace.txt"
     recorder = session.recorder(
-        file, "strace", "-f", "-y", "-ttt", "-s", "0", "-e", "trace=write,fdatasync,fsync,lseek", "-o", trace)
-    while not file.exists():
-        time.sleep(0.05)
-    time.sleep(12)
-    recorder.send_signal(signal.SIGINT)
-    recorder.wait(timeout=60)
+        file, "strace", "-f", "-y", "-ttt", "-s", "0", "-e", "trace=write,fdatasync,fsync,lseek", "-o", trace, lasting="12s")
+    recorder.wait(timeout=90)
     # The size of a chunk is filled in by going back to its begin.
     calls, size, place = [], 0, 0
     for line in trace.read_text().splitlines():

@@ -13,7 +13,7 @@ use crate::cli;
 
 /// Colours of the localizers, in the order of the rows; legible to the colour-blind (Okabe and Ito).
 const COLOURS: [&str; 8] = [
-    "#0072b2", "#d55e00", "#009e73", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666",
+    "#0072b2", "#d55e00", "#009e73", "#000000", "#cc79a7", "#56b4e9", "#e69f00", "#666666",
 ];
 
 const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;max-width:68em;margin:2em auto;padding:0 1em;color:#222}\

@@ -54,7 +54,9 @@ impl FitChangeDetector {
         } else {
             0.0
         };
-        let gain = 1.0 - (-seconds / LEARNED_OVER.min(self.seconds.max(seconds))).exp();
+        // The first scan may come at the time of the pose that was set.
+        let over = LEARNED_OVER.min(self.seconds).max(f64::MIN_POSITIVE);
+        let gain = 1.0 - (-seconds / over).exp();
         let off = (fit - mean).abs();
         self.usual = Some([mean + gain * (fit - mean), variation + gain * (off - variation)]);
         self.below_for.is_some_and(|time| time > 0.0) || self.evidence > ENOUGH
@@ -119,5 +121,18 @@ mod tests {
     #[test]
     fn nothing_changes_before_the_usual_is_known() {
         assert_eq!(first(40.0, 1.8, |time| if time < 0.8 { 0.95 } else { 0.3 }), None);
+    }
+
+    /// The usual fit was not a number from then on: no change was seen any more, and no search confirmed a place.
+    #[test]
+    fn a_scan_at_the_time_of_the_pose_that_was_set_is_learned_from_like_any_other() {
+        let mut detector = FitChangeDetector::default();
+        detector.push(0.9, 0.0);
+        for _ in 0..200 {
+            detector.push(0.9, 0.025);
+        }
+        assert!(detector.usual().is_some_and(|usual| (usual - 0.9).abs() < 1e-9));
+        detector.push(0.3, 0.025);
+        assert!(detector.push(0.3, 0.025));
     }
 }

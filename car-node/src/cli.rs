@@ -28,6 +28,7 @@ pub(crate) struct Cli {
 
 /// What the node can do.
 #[derive(Debug, Subcommand)]
+#[expect(clippy::large_enum_variant, reason = "there is one, at the start")]
 pub(crate) enum Command {
     /// Run the car: read sensors, publish pose, particles, health and load over zenoh, execute commands.
     ///
@@ -582,19 +583,21 @@ fn catalogue() -> String {
     for kind in DefectKind::ALL {
         if part != Some(kind.part()) {
             part = Some(kind.part());
-            text += &format!("{}\n", kind.part());
+            text.push_str(&kind.part().to_string());
+            text.push('\n');
         }
         let sizes: Vec<_> = kind
             .grades()
             .map(Defect::size_text)
             .filter(|size| !size.is_empty())
             .collect();
-        let mut line = format!("  {:<18} {}", kind.name(), kind.text());
-        if !sizes.is_empty() {
-            line += &format!(" ({})", sizes.join(" | "));
-        }
-        text += &line;
-        text.push('\n');
+        let sizes = if sizes.is_empty() {
+            String::new()
+        } else {
+            format!(" ({})", sizes.join(" | "))
+        };
+        let line = format!("  {:<18} {}{sizes}\n", kind.name(), kind.text());
+        text.push_str(&line);
     }
     text
 }

@@ -303,7 +303,9 @@ async fn all_streams_of_a_car_end_together_and_a_car_that_has_left_is_named() {
         let topic = stream.topic;
         assert_eq!(stream.gaps.missing, 0, "{summary}");
         if topic.recovered() {
-            assert!(stream.gaps.last >= by_then[&topic], "{topic} lags: {summary}");
+            // Some topics had nothing to say by then.
+            let by_then = by_then.get(&topic).copied().unwrap_or_default();
+            assert!(stream.gaps.last >= by_then, "{topic} lags: {summary}");
             last.insert(topic, stream.gaps.last);
         }
     }

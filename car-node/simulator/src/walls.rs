@@ -266,9 +266,10 @@ mod tests {
     fn walls_of_a_map_are_its_contours() {
         // A free room of 2 m x 1 m in a map of 5 cm cells.
         let grid = OccupancyGrid::from_fn(60, 40, 0.05, Pose::IDENTITY, |column, row| {
-            match (10..50).contains(&column) && (10..30).contains(&row) {
-                true => Cell::Free,
-                false => Cell::Occupied,
+            if (10..50).contains(&column) && (10..30).contains(&row) {
+                Cell::Free
+            } else {
+                Cell::Occupied
             }
         });
         let walls = Walls::from_grid(&grid);

@@ -37,7 +37,7 @@ fn escaped(text: &str) -> String {
 fn page(arguments: &cli::Race, reports: &[Report]) -> String {
     let track = escaped(reports.first().map_or("", |report| &report.track));
     let seeds = reports.first().map_or(0, |report| report.seeds.len());
-    let legend: String = reports
+    let legend = reports
         .iter()
         .enumerate()
         .filter(|(i, report)| {
@@ -52,7 +52,8 @@ fn page(arguments: &cli::Race, reports: &[Report]) -> String {
                 escaped(&report.localizer)
             )
         })
-        .collect();
+        .collect::<Vec<_>>()
+        .concat();
     let charts: String = [Quality::Hq, Quality::Lq]
         .map(|quality| {
             format!(
@@ -84,12 +85,14 @@ fn colour(report: usize) -> &'static str {
 }
 
 fn row(cells: &[String], class: &str) -> String {
-    let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+    let cells: Vec<String> = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+    let cells = cells.concat();
     format!("<tr{class}>{cells}</tr>")
 }
 
 fn head(cells: &[&str]) -> String {
-    let cells: String = cells.iter().map(|cell| format!("<th>{cell}</th>")).collect();
+    let cells: Vec<String> = cells.iter().map(|cell| format!("<th>{cell}</th>")).collect();
+    let cells = cells.concat();
     format!("<tr>{cells}</tr>")
 }
 

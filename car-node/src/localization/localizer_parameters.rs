@@ -123,12 +123,19 @@ impl LocalizerParameters {
             None => self.clone(),
             Some(_) => match kind_of(kind)? {
                 kind if kind == self.kind() => self.clone(),
-                SYNPF => Parameters::default().into(),
-                EXTERNAL => ExternalParameters::default().into(),
-                POSE_GRAPH => PoseGraphParameters::default().into(),
-                _ => ReferenceParameters::default().into(),
+                kind => Self::default_of(kind),
             },
         })
+    }
+
+    /// The default of a kind of localizer.
+    fn default_of(kind: &str) -> Self {
+        match kind {
+            SYNPF => Parameters::default().into(),
+            EXTERNAL => ExternalParameters::default().into(),
+            POSE_GRAPH => PoseGraphParameters::default().into(),
+            _ => ReferenceParameters::default().into(),
+        }
     }
 
     /// Which kind of localizer it is for: `synpf`, `reference`, `pose-graph` or `external`.
@@ -290,7 +297,16 @@ impl TryFrom<ParameterValues> for LocalizerParameters {
             }
         }
         let kind = kind_of(kind.as_ref()).map_err(|fault| fault.to_string())?;
-        let values = Value::Object(values.into_iter().collect());
+        // What a kept set does not name has its kind's default.
+        let default = if former {
+            ReferenceParameters::default().into()
+        } else {
+            Self::default_of(kind)
+        };
+        let mut all = default.to_values();
+        all.remove(KIND_KEY);
+        all.extend(values);
+        let values = Value::Object(all.into_iter().collect());
         if kind == POSE_GRAPH {
             let set: PoseGraphParameters =
                 serde_json::from_value(values).map_err(|error| error.to_string())?;

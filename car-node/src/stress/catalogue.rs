@@ -215,7 +215,9 @@ impl Defect {
         match self.kind.sizes() {
             [_] => String::new(),
             _ => match (self.size(), self.kind.unit().strip_suffix("s")) {
-                (size, Some(one)) if size == 1.0 && !one.is_empty() => format!("{size} {one}"),
+                (size, Some(one)) if size.to_bits() == 1.0f64.to_bits() && !one.is_empty() => {
+                    format!("{size} {one}")
+                }
                 (size, _) => format!("{size} {}", self.kind.unit()),
             },
         }

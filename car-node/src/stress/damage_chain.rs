@@ -35,6 +35,8 @@ impl DamageChain {
             }
             messages = damaged;
         }
-        messages.into_iter().for_each(|message| queue.push(message));
+        for message in messages {
+            queue.push(message);
+        }
     }
 }

@@ -130,6 +130,7 @@ impl SensorDamage {
         due
     }
 
+    #[expect(clippy::too_many_lines, reason = "one arm for each kind of defect")]
     fn scan(
         &mut self,
         mut scan: Scan,
@@ -282,16 +283,13 @@ impl SensorDamage {
             angular: odometry.twist.angular * turn + bias,
         };
         self.odometry = Some([odometry, damaged]);
-        match self.defect.kind {
+        let kind = self.defect.kind;
+        match kind {
             DefectKind::OdometryNoise => {
                 damaged.pose.x += size / 100.0 * self.normal();
                 damaged.pose.y += size / 100.0 * self.normal();
             }
-            DefectKind::OdometrySlow => {
-                if !self.due(odometry.stamp, size) {
-                    return None;
-                }
-            }
+            DefectKind::OdometrySlow if !self.due(odometry.stamp, size) => return None,
             DefectKind::OdometryGap if elapsed >= FAULT_EVERY && elapsed.rem_euclid(FAULT_EVERY) < size => {
                 return None;
             }
@@ -406,6 +404,7 @@ mod tests {
     use crate::stress::DefectChoice;
 
     /// Twenty seconds on a circle of 5 m radius at 2 m/s: odometry 50 times a second, a scan of 61 beams 20 times.
+    #[expect(clippy::unnecessary_wraps, reason = "a truth may be unknown elsewhere")]
     fn truth(stamp: Stamp) -> Option<Pose> {
         let angle = 0.4 * stamp.since(Stamp(0));
         Some(Pose::exp([5.0 * angle, 0.0, angle]))

@@ -108,10 +108,8 @@ fn start_killed(socket: &Path, project: &str) -> anyhow::Result<Vec<String>> {
 fn ask(socket: &Path, method: &str, path: &str) -> anyhow::Result<(u16, Vec<u8>)> {
     let mut stream = UnixStream::connect(socket).with_context(|| socket.display().to_string())?;
     stream.set_read_timeout(Some(Duration::from_secs(30)))?;
-    write!(
-        stream,
-        "{method} {path} HTTP/1.0\r\nHost: docker\r\nContent-Length: 0\r\n\r\n"
-    )?;
+    let request = format!("{method} {path} HTTP/1.0\r\nHost: docker\r\nContent-Length: 0\r\n\r\n");
+    stream.write_all(request.as_bytes())?;
     let mut answer = Vec::new();
     stream.take(LONGEST).read_to_end(&mut answer)?;
     parse(&answer)
@@ -155,9 +153,13 @@ mod tests {
             // The list, the state of two containers, and one start.
             for stream in listener.incoming().take(4) {
                 let mut stream = stream.expect("a connection");
-                let mut request = [0; 2000];
-                let length = stream.read(&mut request).expect("a request");
-                let request = String::from_utf8_lossy(&request[..length]).into_owned();
+                let mut request = Vec::new();
+                while !request.ends_with(b"\r\n\r\n") {
+                    let mut byte = [0];
+                    stream.read_exact(&mut byte).expect("a request");
+                    request.extend(byte);
+                }
+                let request = String::from_utf8_lossy(&request).into_owned();
                 let body = if request.contains("/containers/json") {
                     assert!(request.contains("project%3Drace"), "{request}");
                     r#"[{"Id":"aa","Names":["/race_car-1"]},{"Id":"bb","Names":["/race_keys"]}]"#

@@ -45,7 +45,7 @@ pub struct CarView {
     pub clock_uncertainty_s: Option<f64>,
     /// Every stream by topic.
     pub streams: BTreeMap<&'static str, StreamView>,
-    /// Messages whose content was sent and has not arrived, see [`missing_content`].
+    /// Messages whose content was sent and has not arrived, counted per content.
     pub missing: u64,
     /// Share of the messages sent, of the streams that must be complete, that are here, in `[0, 1]`; None before the first.
     pub coverage: Option<f64>,
@@ -61,10 +61,6 @@ pub struct CarView {
 
 impl Car {
     /// The car at `now` \[unix ns\].
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one field or event after the other, without branches in between"
-    )]
     pub fn view(&self, now: i64) -> CarView {
         let seconds = |ns: i64| ns as f64 * 1e-9;
         let offset = self.clock_offset();

@@ -54,10 +54,6 @@ impl Fleet {
     const REPORT_TOO_MANY: i64 = 60_000_000_000;
 
     /// Applies an event.
-    #[expect(
-        clippy::too_many_lines,
-        reason = "one field or event after the other, without branches in between"
-    )]
     pub fn apply(&mut self, event: &FleetEvent) {
         let FleetEvent {
             at,

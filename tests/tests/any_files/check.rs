@@ -195,7 +195,7 @@ fn recording(path: &Path) -> Vec<u8> {
         )));
         // Several chunks: each sync closes one.
         if number % 40 == 0 {
-            let (deadline, written) = (Instant::now() + Duration::from_secs(60), 3 * number);
+            let (deadline, written) = (Instant::now() + Duration::from_mins(1), 3 * number);
             while recorder.progress().messages < written && Instant::now() < deadline {
                 std::thread::sleep(Duration::from_millis(5));
             }

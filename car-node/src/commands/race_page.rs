@@ -240,9 +240,10 @@ impl Chart {
     }
 
     fn line(&mut self, points: impl Iterator<Item = [f64; 2]>, colour: &str) {
-        let path: String = points
-            .map(|[x, y]| format!("{:.1},{:.1} ", self.at_x(x), self.at_y(y)))
+        let path: Vec<String> = points
+            .map(|[x, y]| format!("{:.1},{:.1}", self.at_x(x), self.at_y(y)))
             .collect();
+        let path = path.join(" ");
         self.add(format_args!(
             "<polyline points=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"1.6\"/>"
         ));
@@ -267,13 +268,7 @@ impl Chart {
 
 /// A number with as many digits as its axis needs.
 fn label(value: f64, span: f64) -> String {
-    let digits = if span < 2.0 {
-        2
-    } else if span < 20.0 {
-        1
-    } else {
-        0
-    };
+    let digits = if span < 2.0 { 2 } else { usize::from(span < 20.0) };
     format!("{value:.digits$}")
 }
 
@@ -304,10 +299,13 @@ fn along_track(reports: &[Report], quality: Quality) -> String {
     chart.svg()
 }
 
+/// What a strip of dots shows of a lap.
+type OfLap = fn(&LapRecord) -> f64;
+
 /// Every lap as a dot: lap time, and distance of the car from the raceline.
 fn distributions(reports: &[Report], quality: Quality) -> String {
     let all = || of(reports, quality).flat_map(|(_, report)| &report.summary.every_lap);
-    let strips: [(&str, fn(&LapRecord) -> f64); 2] = [
+    let strips: [(&str, OfLap); 2] = [
         ("lap time, s", |lap| lap.time_s),
         ("car to line, cm", |lap| 100.0 * lap.true_line_error_m),
     ];

@@ -153,7 +153,7 @@ fn progress_bar(runs: usize, set: &str) -> ProgressBar {
     bar
 }
 
-/// Colours of a terminal; none where the output is a file, or where NO_COLOR is set.
+/// Colours of a terminal; none where the output is a file, or where `NO_COLOR` is set.
 #[derive(Debug, Clone, Copy)]
 struct Colours(bool);
 

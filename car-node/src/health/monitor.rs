@@ -562,6 +562,20 @@ mod tests {
         }
     }
 
+    /// Another place explained a little more, and a pose with a long history was DEGRADED for half of a drive.
+    #[test]
+    fn a_rival_that_is_most_unlikely_is_said_and_degrades_nothing() {
+        let mut drive = Drive::localized();
+        let states = drive.drive(2.0, |update| {
+            update.doubt = Some(Doubt {
+                probability: 0.002,
+                rival: Some(Pose::new(3.0, 0.0, 0.0)),
+            });
+        });
+        assert_eq!(states, [State::Localized]);
+        assert_eq!(drive.kinds(), [CauseKind::SecondMode]);
+    }
+
     #[test]
     fn one_family_alone_degrades_and_is_not_lost() {
         let alone: [fn(&mut Update); 2] = [

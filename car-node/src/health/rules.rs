@@ -112,7 +112,7 @@ pub(super) fn findings(evidence: &Evidence<'_>, t: &Thresholds) -> Vec<Finding> 
     fit.into_iter()
         .chain([long_beams(evidence, off_walls, t)])
         .chain(pose(evidence.metrics, t))
-        .chain([evidence.doubt.map(in_doubt)])
+        .chain([evidence.doubt.map(|doubt| in_doubt(doubt, t))])
         .chain(hints(evidence, t))
         .flatten()
         .collect()
@@ -177,17 +177,22 @@ fn pose(metrics: &Metrics, t: &Thresholds) -> [Option<Finding>; 5] {
 }
 
 /// The localizer doubts its pose: another place explains the scans as well, or the scan does not match the one before.
-fn in_doubt(doubt: Doubt) -> Finding {
+fn in_doubt(doubt: Doubt, t: &Thresholds) -> Finding {
+    let serious = doubt.probability > t.doubted;
     Finding {
         kind: if doubt.rival.is_some() {
             CauseKind::SecondMode
         } else {
             CauseKind::Likelihood
         },
-        severity: Severity::Warning,
+        severity: if serious {
+            Severity::Warning
+        } else {
+            Severity::Info
+        },
         value: doubt.probability,
-        limit: 0.0,
-        degrades: true,
+        limit: t.doubted,
+        degrades: serious,
         at_once: true,
         lost: None,
     }

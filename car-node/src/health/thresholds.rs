@@ -80,6 +80,8 @@ pub struct Thresholds {
     pub confirmed_after: f64,
     /// Log of the odds above which a localizer's own judgement keeps a pose from being lost by the fit of scans alone.
     pub trusted: f64,
+    /// Probability that the pose is wrong, by the localizer itself, above which the state is degraded: log odds of 5.
+    pub doubted: f64,
 }
 
 impl Default for Thresholds {
@@ -118,6 +120,7 @@ impl Default for Thresholds {
             good_for: 0.5,
             confirmed_after: 1.0,
             trusted: 5.0,
+            doubted: 0.0067,
         }
     }
 }

@@ -162,20 +162,20 @@ fn the_pose_continues_through_every_switch_of_set_on_slipping_tyres() {
         .filter(|name| !name.starts_with("pose-graph"))
         .collect();
     assert!(names.len() >= 4, "{names:?}");
-    drive_circuit(&names, car_on_taped_tyres());
+    drive_circuit(&names, vec![car_on_taped_tyres()]);
 }
 
 #[test]
 fn the_pose_continues_through_every_switch_of_set_on_tyres_that_grip() {
-    drive_circuit(&LocalizerParameters::NAMES, CarSetup::default());
+    drive_circuit(&LocalizerParameters::NAMES, vec![CarSetup::default()]);
 }
 
-/// Drives `car` through all ordered pairs of the sets.
-fn drive_circuit(names: &[&'static str], car: CarSetup) {
+/// Drives the first of the cars through all ordered pairs of the sets.
+fn drive_circuit(names: &[&'static str], cars: Vec<CarSetup>) {
     let tracks = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/tracks");
     let track = Track::load(tracks.join("club"), None).expect("bundled");
     let map = Arc::new(TrackMap::new(track.grid.clone()).expect("free cells"));
-    let mut source = Race::new(track, vec![car], 1, Vec::new()).car(0);
+    let mut source = Race::new(track, cars, 1, Vec::new()).car(0);
     let begin = source.start().expect("known");
     let sets = circuit(names);
     let mut car = Car::start(

@@ -21,6 +21,7 @@
 mod external_pose;
 mod hand_over;
 mod parameters;
+pub mod received;
 mod scan_fit;
 mod sensor_finding;
 mod sensors;

@@ -5,23 +5,12 @@
 
 use std::collections::VecDeque;
 
+use localizer::received::{CARRY, FASTEST_TURN, KEPT, is_possible, keep_yaw_rate};
 use localizer::{Dropped, Odometry, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::parameters::PoseGraphParameters;
 use crate::sampler::FixedRatioSampler;
-
-/// Longest that odometry is carried on beyond its last message \[s\]; a scan later than that is dropped.
-pub(crate) const CARRY: f64 = 0.25;
-
-/// Messages that are kept: 2 s at 200 Hz.
-const KEPT: usize = 400;
-
-/// Farther from the origin no car drives \[m\].
-const FARTHEST: f64 = 1e7;
-
-/// Faster [m/s], [rad/s] is no car of this kind.
-const FASTEST: f64 = 100.0;
 
 /// Odometry that moves faster than this [m/s] between two messages, and by more than this \[m\], has been set anew.
 const JUMP: [f64; 2] = [30.0, 0.3];
@@ -56,15 +45,8 @@ impl PoseExtrapolator {
         odometry: &Odometry,
         parameters: &PoseGraphParameters,
     ) -> Result<(), Dropped> {
-        let sane = |v: f64, limit: f64| v.is_finite() && v.abs() < limit;
-        let (pose, twist) = (odometry.pose, odometry.twist);
-        let possible = sane(pose.x, FARTHEST)
-            && sane(pose.y, FARTHEST)
-            && pose.heading.is_finite()
-            && [twist.linear_x, twist.linear_y, twist.angular]
-                .iter()
-                .all(|&v| sane(v, FASTEST));
-        if !possible {
+        let pose = odometry.pose;
+        if !(pose.heading.is_finite() && is_possible(odometry, FASTEST_TURN)) {
             return Err(Dropped::Malformed);
         }
         let mut continuous = pose;
@@ -95,21 +77,7 @@ impl PoseExtrapolator {
 
     /// Takes in a gyroscope's reading.
     pub(crate) fn add_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < FASTEST) {
-            return Err(Dropped::Malformed);
-        }
-        if self
-            .yaw_rates
-            .back()
-            .is_some_and(|last| yaw_rate.stamp <= last.stamp)
-        {
-            return Err(Dropped::TimeBackwards);
-        }
-        self.yaw_rates.push_back(*yaw_rate);
-        if self.yaw_rates.len() > KEPT {
-            self.yaw_rates.pop_front();
-        }
-        Ok(())
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate, FASTEST_TURN)
     }
 
     /// The stamp of the latest odometry.

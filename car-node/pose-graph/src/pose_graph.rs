@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use localizer::received::CARRY;
 use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
     ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, ScanFit, SensorFindings, Stamp,
@@ -17,7 +18,7 @@ use crate::graph::Graph;
 use crate::local_trajectory_builder::{LocalMatch, LocalTrajectoryBuilder};
 use crate::match_errors::MatchErrors;
 use crate::parameters::PoseGraphParameters;
-use crate::pose_extrapolator::{CARRY, PoseExtrapolator};
+use crate::pose_extrapolator::PoseExtrapolator;
 use crate::range_data::Points;
 use crate::sampler::FixedRatioSampler;
 use crate::slip::SlipMeter;

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use localizer::received::{CARRY, FASTEST_TURN, KEPT, is_possible, keep_yaw_rate};
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -13,18 +14,14 @@ use synpf::{
     Update, WeightedPose, YawRate,
 };
 
-/// Longest that odometry is carried on beyond its last message \[s\].
-const CARRY: f64 = 0.25;
-/// Messages that are kept: 2 s at 200 Hz.
-const KEPT: usize = 400;
 /// Slip is judged over this long \[s\]: single poses of other localizers scatter by centimetres.
 const SLIP_TIME: f64 = 1.0;
 /// Slip is a share of the way, and none below this \[m\].
 const SHORTEST: f64 = 0.3;
 /// Poses that are kept to judge slip.
 const MOST_ANCHORS: usize = 256;
-/// Faster [m/s], [rad/s] is no car.
-const FASTEST: f64 = 100.0;
+/// No angle of a scanner is larger \[rad\], and no scan takes longer \[s\].
+const MOST_GEOMETRY: f64 = 100.0;
 /// Most beams of a scanner that we believe in.
 const MOST_BEAMS: usize = 14_400;
 
@@ -288,13 +285,7 @@ impl Localizer for External {
     }
 
     fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
-        let Twist {
-            linear_x,
-            linear_y,
-            angular,
-        } = odometry.twist;
-        let possible = |v: f64| v.is_finite() && v.abs() < FASTEST;
-        if !(odometry.pose.is_finite() && [linear_x, linear_y, angular].into_iter().all(possible)) {
+        if !(odometry.pose.is_finite() && is_possible(odometry, FASTEST_TURN)) {
             return Err(Dropped::Malformed);
         }
         if let Some(last) = self.odometry.back() {
@@ -312,21 +303,7 @@ impl Localizer for External {
     }
 
     fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        if !(yaw_rate.rate.is_finite() && yaw_rate.rate.abs() < FASTEST) {
-            return Err(Dropped::Malformed);
-        }
-        if self
-            .yaw_rates
-            .back()
-            .is_some_and(|last| yaw_rate.stamp <= last.stamp)
-        {
-            return Err(Dropped::TimeBackwards);
-        }
-        self.yaw_rates.push_back(*yaw_rate);
-        if self.yaw_rates.len() > KEPT {
-            self.yaw_rates.pop_front();
-        }
-        Ok(())
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate, FASTEST_TURN)
     }
 
     fn on_external_pose(&mut self, pose: &ExternalPose) -> Result<(), Dropped> {
@@ -350,7 +327,7 @@ impl Localizer for External {
             scan.time_increment * count as f64,
         ];
         if !(1..=MOST_BEAMS).contains(&count)
-            || geometry.iter().any(|v| !v.is_finite() || v.abs() > FASTEST)
+            || geometry.iter().any(|v| !v.is_finite() || v.abs() > MOST_GEOMETRY)
             || !(0.0..1.0).contains(&geometry[2])
             || scan.angle_increment == 0.0
         {

@@ -16,8 +16,7 @@ impl Estimate {
     /// The estimate carried on by a motion of `base_link`, whose uncertainty in its own frame is `noise`.
     pub(crate) fn moved(&self, motion: Pose, noise: &Matrix3<f64>) -> Self {
         let pose = self.pose * motion;
-        let (dx, dy) = (pose.x - self.pose.x, pose.y - self.pose.y);
-        let jacobian = Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0);
+        let jacobian = carry(self.pose, pose);
         let turn = rotation(self.pose.heading);
         let covariance = jacobian * self.covariance * jacobian.transpose() + turn * noise * turn.transpose();
         Self { pose, covariance }
@@ -38,6 +37,12 @@ impl Estimate {
         let own = turn.transpose() * self.covariance * turn;
         [own[(0, 0)].max(0.0).sqrt(), own[(1, 1)].max(0.0).sqrt()]
     }
+}
+
+/// How an error of a pose is carried on by a motion: its Jacobian, in the frame of the poses.
+pub(crate) fn carry(from: Pose, to: Pose) -> Matrix3<f64> {
+    let (dx, dy) = (to.x - from.x, to.y - from.y);
+    Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0)
 }
 
 /// Turns the covariance of x, y and heading from a frame at `heading` \[rad\] into the frame around it.

@@ -75,7 +75,6 @@ mod preprocessed_scan;
 mod quality;
 mod range_table;
 mod ranges;
-mod received;
 mod recovery;
 mod reference;
 mod regions;

@@ -2,11 +2,11 @@
 
 use std::collections::VecDeque;
 
+use localizer::received::{KEPT, is_possible, keep_yaw_rate};
 use localizer::{Dropped, Odometry, SensorFindings, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::calibration::{Drive, SlipModel};
-use crate::received::{KEPT, is_possible, keep_yaw_rate};
 use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, WheelGrip};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
@@ -50,6 +50,10 @@ const GAP: f64 = 0.5;
 
 /// Wheels that turn faster than this do not creep [m/s].
 const SLOW: f64 = 0.3;
+
+/// A faster turn [rad/s] is none, in whatever unit: in deg/s a turn has up to 57 times its number, which [`crate::sensor_check`]
+/// finds out.
+const FASTEST_READING: f64 = 1000.0;
 
 /// A gyroscope is silent when its last reading is older than this \[s\].
 const GYRO_SILENT: f64 = 0.1;
@@ -97,7 +101,7 @@ impl OdometryTrack {
         use_imu: bool,
         slip: &SlipModel,
     ) -> Result<(), Dropped> {
-        if !is_possible(odometry) {
+        if !is_possible(odometry, FASTEST_READING) {
             return Err(Dropped::Malformed);
         }
         if self
@@ -265,7 +269,7 @@ impl OdometryTrack {
     }
 
     pub(crate) fn push_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        keep_yaw_rate(&mut self.yaw_rates, yaw_rate)
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate, FASTEST_READING)
     }
 
     /// The jumps since this was last asked, as a motion of the smooth frame: with it in front, later poses are where they

@@ -7,6 +7,7 @@ pub(crate) mod stages;
 
 use std::sync::Arc;
 
+use localizer::received::CARRY;
 use localizer::{
     Doubt, Dropped, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode, Odometry,
     ParameterFault, ParameterValues, PoseError, PreparedParameters, Scan, Stamp, Twist, Update, WeightedPose,
@@ -25,7 +26,6 @@ use crate::parameters::Parameters;
 use crate::particle_filter::{ParticleFilter, Weighted};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
-use crate::received::CARRY;
 use crate::recovery::{Decision, Evidence, Recovery};
 use crate::sensor_check::SensorCheck;
 use crate::track_map::TrackMap;

@@ -8,7 +8,7 @@ use maps::{DistanceField, Pose};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::calibration::WallCalibration;
-use crate::estimate::{Estimate, rotation};
+use crate::estimate::{Estimate, carry, rotation};
 use crate::innovation_gate::InnovationGate;
 use crate::motion_model::MotionParameters;
 use crate::particle_filter::Weighted;
@@ -129,12 +129,7 @@ impl Tracker {
         let mut predicted = self.estimate.moved(motion, &steady);
         let Drift { by, variance, kept } = Drift::new(motion, seconds, uncertainty, parameters);
         let by = rotation(self.estimate.pose.heading) * by;
-        let (dx, dy) = (
-            predicted.pose.x - self.estimate.pose.x,
-            predicted.pose.y - self.estimate.pose.y,
-        );
-        let moved = Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0);
-        let carried = moved * self.with_drift;
+        let carried = carry(self.estimate.pose, predicted.pose) * self.with_drift;
         let mixed = carried * by.transpose();
         predicted.covariance += by * variance * by.transpose() + mixed + mixed.transpose();
         self.predicted_with_drift = (carried + by * variance) * kept;

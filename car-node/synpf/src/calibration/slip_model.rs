@@ -8,7 +8,7 @@
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, carry};
 
 /// What slip depends on at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -109,8 +109,7 @@ impl SlipModel {
             along * (-drive.acceleration * way),
             left * (-drive.lateral * way),
         ]);
-        let (dx, dy) = (to.x - from.x, to.y - from.y);
-        let moved = Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0);
+        let moved = carry(from, to);
         let mixed = pose_by_slip * self.with_pose * moved.transpose();
         predicted.covariance +=
             pose_by_slip * self.covariance * pose_by_slip.transpose() + mixed + mixed.transpose();

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use localizer::received::{CARRY, FASTEST_TURN, KEPT, is_possible, keep_yaw_rate};
 use localizer::{
     Dropped, HandOver, HandedEstimate, Hypothesis, Localizer, Mode, Odometry, ParameterFault,
     ParameterValues, PoseError, PreparedParameters, Scan, SensorFindings, Stamp, Twist, Update, WeightedPose,
@@ -19,7 +20,6 @@ use super::range_table::{Method, Table, Walls};
 use super::sensor_table::SensorTable;
 use crate::error::SetUpError;
 use crate::quality::Quality;
-use crate::received::{CARRY, KEPT, is_possible, keep_yaw_rate};
 use crate::track_map::TrackMap;
 
 /// Weight of a particle off the track.
@@ -431,7 +431,7 @@ impl Localizer for Reference {
     }
 
     fn on_odometry(&mut self, odometry: &Odometry) -> Result<(), Dropped> {
-        if !(odometry.pose.is_finite() && is_possible(odometry)) {
+        if !(odometry.pose.is_finite() && is_possible(odometry, FASTEST_TURN)) {
             return Err(Dropped::Malformed);
         }
         let last = self.odometry.back().copied();
@@ -472,7 +472,7 @@ impl Localizer for Reference {
     }
 
     fn on_yaw_rate(&mut self, yaw_rate: &YawRate) -> Result<(), Dropped> {
-        keep_yaw_rate(&mut self.yaw_rates, yaw_rate)
+        keep_yaw_rate(&mut self.yaw_rates, yaw_rate, FASTEST_TURN)
     }
 
     fn on_scan(&mut self, scan: &Scan) -> Result<Update, Dropped> {

@@ -1,5 +1,6 @@
 //! Where the checks of the sensors meet the filter: what each scan teaches them, and what they have found.
 
+use localizer::received::CARRY;
 use localizer::{Scan, SensorFindings};
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
@@ -7,7 +8,6 @@ use nalgebra::{Matrix3, Vector3};
 use super::{Step, SynPf};
 use crate::calibration::SlipModel;
 use crate::estimate::Estimate;
-use crate::received::CARRY;
 use crate::scan_matcher::{fit, match_scan};
 use crate::sensor_check::{ScanGeometry, SweepCheck};
 use crate::{Dropped, Mode};

@@ -23,6 +23,9 @@ use super::summary::RecordingSummary;
 use super::writer::RecordingWriter;
 use crate::event::{EventPayload, FleetEvent};
 
+/// Clocks whose difference changes by more than one part in so many were set in between.
+const STEADY: u64 = 100;
+
 /// Messages of one file in memory.
 const AHEAD: usize = 512;
 
@@ -234,19 +237,30 @@ impl Known {
         }
     }
 
-    /// A time of the car's clock by the laptop's, from the comparison that is nearest to it.
+    /// A time of the car's clock by the laptop's: between two comparisons their differences go over into each other, so that
+    /// the order of times stays. Where the clock was set between them, the nearer one counts.
     fn by_the_laptop(&self, car: &CarName, at: i64) -> i64 {
         let Some(clocks) = self.clocks.get(car) else {
             return at;
         };
         let next = clocks.partition_point(|(time, _)| *time < at);
-        let near = [next.checked_sub(1), Some(next)];
-        let nearest = near
-            .into_iter()
-            .flatten()
-            .filter_map(|index| clocks.get(index))
-            .min_by_key(|(time, _)| time.abs_diff(at));
-        at.saturating_sub(nearest.map_or(0, |(_, offset)| *offset))
+        let before = next.checked_sub(1).and_then(|index| clocks.get(index));
+        let offset = match (before, clocks.get(next)) {
+            (Some(&(from, first)), Some(&(to, second))) => {
+                let (passed, between) = (at.abs_diff(from), to.abs_diff(from));
+                if second.abs_diff(first) <= between / STEADY {
+                    let share = passed as f64 / between.max(1) as f64;
+                    first + ((second - first) as f64 * share) as i64
+                } else if passed <= to.abs_diff(at) {
+                    first
+                } else {
+                    second
+                }
+            }
+            (Some((_, only)), None) | (None, Some((_, only))) => *only,
+            (None, None) => 0,
+        };
+        at.saturating_sub(offset)
     }
 }
 
@@ -689,6 +703,24 @@ mod tests {
         }
         let error = merge(&inputs, &path("merged.mcap")).expect_err("never overwritten");
         assert!(error.to_string().contains("exists already"), "{error}");
+    }
+
+    /// By the nearest comparison alone, a message half way between two got an earlier time than the one before it.
+    #[test]
+    fn times_stay_in_order_between_two_comparisons_of_clocks() {
+        let mut known = Known::default();
+        known.clocks.insert(car(), vec![(0, 0), (SECOND, 2_000_000)]);
+        let times: Vec<_> = (0..=1100)
+            .map(|ms| known.by_the_laptop(&car(), ms * 1_000_000))
+            .collect();
+        assert!(times.windows(2).all(|pair| pair[0] < pair[1]));
+        assert_eq!([times[500], times[1100]], [499_000_000, 1_098_000_000]);
+        // A clock that was set: there is nothing between.
+        known
+            .clocks
+            .insert(car(), vec![(0, 0), (3601 * SECOND, 3600 * SECOND)]);
+        let at = |seconds: i64| known.by_the_laptop(&car(), seconds * SECOND);
+        assert_eq!([at(1), at(3600)], [SECOND, 0]);
     }
 
     #[test]

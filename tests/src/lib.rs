@@ -33,6 +33,19 @@ use tempfile::TempDir;
 /// How long a condition or an answer may take before a test fails. It is long, because machines may be busy.
 pub const DEADLINE: Duration = Duration::from_mins(1);
 
+/// A program that is neither car nor pit wall.
+pub async fn stranger(endpoint: &str) -> zenoh::Session {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", r#""client""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ] {
+        config.insert_json5(key, &value).expect("a good setting");
+    }
+    zenoh::open(config).await.expect("a session")
+}
+
 /// A car's name.
 pub fn named(name: &str) -> CarName {
     CarName::new(name).expect("a good name")

@@ -10,8 +10,7 @@ use std::time::Duration;
 use keys::Protection;
 use pitwall::{Fleet, FleetService, PageOptions, PitWallOptions, PitWallServer, unix_now};
 use protocol::{CarName, Event, EventKind, Key, Stamps, Topic, encode};
-use system_tests::{Behaviour, FakeCar, free_endpoint, named, router, wait_until};
-use zenoh::Session;
+use system_tests::{Behaviour, FakeCar, free_endpoint, named, router, stranger, wait_until};
 use zenoh::qos::CongestionControl;
 
 async fn pit_wall(endpoint: &str) -> Arc<FleetService> {
@@ -24,18 +23,6 @@ fn times() -> usize {
         .ok()
         .and_then(|factor| factor.parse().ok())
         .unwrap_or(1)
-}
-
-async fn stranger(endpoint: &str) -> Session {
-    let mut config = zenoh::Config::default();
-    for (key, value) in [
-        ("mode", r#""client""#.to_owned()),
-        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
-        ("scouting/multicast/enabled", "false".to_owned()),
-    ] {
-        config.insert_json5(key, &value).expect("a good setting");
-    }
-    zenoh::open(config).await.expect("a session")
 }
 
 async fn real_cars(endpoint: &str, wall: &FleetService) -> Vec<FakeCar> {

@@ -7,21 +7,8 @@ use protocol::{
     Action, CarName, Command, CommandId, Header, Key, LinkReport, Message, ParamsAction, Stamps, Topic,
     encode,
 };
-use system_tests::{free_endpoint, in_force, router, select, send_command, start_real, wait_until};
+use system_tests::{free_endpoint, in_force, router, select, send_command, start_real, stranger, wait_until};
 use zenoh::qos::CongestionControl;
-
-/// A program that is neither car nor pit wall.
-async fn stranger(endpoint: &str) -> zenoh::Session {
-    let mut config = zenoh::Config::default();
-    for (key, value) in [
-        ("mode", r#""client""#.to_owned()),
-        ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
-        ("scouting/multicast/enabled", "false".to_owned()),
-    ] {
-        config.insert_json5(key, &value).expect("a good setting");
-    }
-    zenoh::open(config).await.expect("a session")
-}
 
 /// Random bytes that are the same in every run (xorshift, Marsaglia 2003).
 fn random(length: usize, mut state: u64) -> Vec<u8> {

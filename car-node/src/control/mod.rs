@@ -22,4 +22,5 @@ pub use answer_cache::{CachedAnswer, PayloadHash};
 pub use command_handler::{CommandHandler, CommandHandlerConfig, SEARCH_PATIENCE};
 pub use local_commands::{LocalCommands, LocalRequest};
 pub use request::Request;
+pub(crate) use request::serve;
 pub use state_file::{StateFile, StateFileError};

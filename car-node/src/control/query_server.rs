@@ -3,13 +3,12 @@
 //! It is separate from the command server, so that a map on its way over a slow link delays no command.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::{self, JoinHandle};
+use std::thread::JoinHandle;
 
-use crossbeam_channel::{Receiver, select};
+use crossbeam_channel::Receiver;
 use protocol::{MissingRequest, Stamps, Topic, decode, encode};
-use zenoh::Wait;
 
-use super::request::Request;
+use super::request::{Request, serve};
 use crate::sensors::clock::wall_now;
 use crate::telemetry::replay_buffer::ReplayBuffer;
 use crate::telemetry::shared_state::SharedState;
@@ -32,28 +31,9 @@ pub struct QueryServer {
 impl QueryServer {
     /// Starts the thread. It ends when `stop` is dropped.
     pub fn start(self, requests: Receiver<Request>, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
-        thread::Builder::new().name("query-server".into()).spawn(move || {
-            loop {
-                select! {
-                    recv(stop) -> _ => return,
-                    recv(requests) -> request => match request {
-                        Ok(request) => self.serve(&request),
-                        Err(_) => return,
-                    },
-                }
-            }
+        serve("query-server", requests, stop, move |topic, payload| {
+            self.reply(topic, payload)
         })
-    }
-
-    fn serve(&self, Request { topic, query }: &Request) {
-        let payload = query.payload().map(|payload| payload.to_bytes());
-        let sent = match self.reply(*topic, payload.as_deref()) {
-            Ok(bytes) => query.reply(query.key_expr().clone(), bytes).wait(),
-            Err(error) => query.reply_err(error).wait(),
-        };
-        if let Err(error) = sent {
-            tracing::debug!(%error, "the reply could not be sent");
-        }
     }
 
     /// The encoded reply; an error names what is wrong with a query that cannot be decoded.

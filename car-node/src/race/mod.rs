@@ -17,7 +17,7 @@ use rand::rngs::SmallRng;
 use serde::{Deserialize, Serialize};
 use simulator::{CarSetup, Estimate, Grip, Guidance, Manoeuvre, Message, TICK, Track, World};
 
-use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist, YawRate};
+use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist};
 
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use paper::{PAPER_ROWS, PaperRow};
@@ -26,7 +26,7 @@ pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSum
 use crate::health::{Monitor, Thresholds};
 use crate::localization::LocalizerParameters;
 use crate::sensors::bag::{Arrival, SensorEvent};
-use crate::sensors::{Script, ScriptedIncident};
+use crate::sensors::{Script, ScriptedIncident, sensor_event};
 use crate::stress::{ArrivalQueue, DamageChain, DamagedArrival, Defect, DefectKind, map_damage};
 use results::CarMeasurements;
 
@@ -309,7 +309,7 @@ impl CarRunner {
     /// Gives a message to the localizer, and those that have arrived with it. Returns a new estimate, if there is one.
     fn handle(&mut self, world: &World, index: usize, message: &Message) -> Option<Estimate> {
         let now = stamp(world.now());
-        if let Some(event) = sensor_event(message) {
+        if let Ok(event) = sensor_event(message.clone(), stamp) {
             if let SensorEvent::Odometry(odometry) = &event {
                 self.speeds = [odometry.twist.linear_x, odometry.twist.angular];
             }
@@ -488,37 +488,6 @@ fn true_pose(truths: &VecDeque<(Stamp, Pose)>, time: Stamp) -> Option<Pose> {
         from.y + share * (to.y - from.y),
         from.heading + share * wrap_angle(to.heading - from.heading),
     ))
-}
-
-/// What a sensor of a simulated car delivers, as a localizer takes it; None for other messages.
-fn sensor_event(message: &Message) -> Option<SensorEvent> {
-    Some(match message {
-        Message::Odometry(odometry) => SensorEvent::Odometry(Odometry {
-            stamp: stamp(odometry.stamp),
-            pose: odometry.pose,
-            twist: Twist {
-                linear_x: odometry.speed,
-                linear_y: 0.0,
-                angular: odometry.yaw_rate,
-            },
-        }),
-        Message::Gyro(gyro) => SensorEvent::YawRate(YawRate {
-            stamp: stamp(gyro.stamp),
-            rate: gyro.yaw_rate,
-        }),
-        Message::Scan(scan) => SensorEvent::Scan(Scan {
-            stamp: stamp(scan.stamp),
-            angle_min: scan.angle_min,
-            angle_increment: scan.angle_increment,
-            time_increment: scan.time_increment,
-            scan_time: None,
-            angle_max: None,
-            range_min: scan.range_min,
-            range_max: scan.range_max,
-            ranges: scan.ranges.clone(),
-        }),
-        _ => return None,
-    })
 }
 
 /// The simulator's time as a stamp. It starts at zero; a localizer only uses differences.

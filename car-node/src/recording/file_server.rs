@@ -4,15 +4,14 @@
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::sync::Arc;
-use std::thread::{self, JoinHandle};
+use std::thread::JoinHandle;
 
-use crossbeam_channel::{Receiver, select};
+use crossbeam_channel::Receiver;
 use protocol::{FileInfo, FilesReply, FilesRequest, Stamps, decode, encode};
 use xxhash_rust::xxh3::Xxh3;
-use zenoh::Wait;
 
 use super::recorder::Recorder;
-use crate::control::Request;
+use crate::control::{Request, serve};
 use crate::sensors::clock::wall_now;
 use crate::telemetry::shared_state::SharedState;
 
@@ -29,34 +28,14 @@ pub struct FileServer {
 impl FileServer {
     /// Starts the thread. It ends when `stop` is dropped.
     pub fn start(self, requests: Receiver<Request>, stop: Receiver<()>) -> io::Result<JoinHandle<()>> {
-        thread::Builder::new().name("file-server".into()).spawn(move || {
-            loop {
-                select! {
-                    recv(stop) -> _ => return,
-                    recv(requests) -> request => match request {
-                        Ok(request) => self.serve(&request),
-                        Err(_) => return,
-                    },
-                }
-            }
-        })
-    }
-
-    fn serve(&self, Request { topic, query }: &Request) {
-        let payload = query.payload().map(|payload| payload.to_bytes());
-        let sent = match self.answer(payload.as_deref()) {
-            Ok(bytes) => query.reply(query.key_expr().clone(), bytes).wait(),
-            Err(error) => {
+        serve("file-server", requests, stop, move |topic, payload| {
+            self.answer(payload).inspect_err(|error| {
                 let count = self.shared.counters.bad_payload() + 1;
                 if count.is_power_of_two() {
                     tracing::warn!(%topic, count, error, "a request cannot be read");
                 }
-                query.reply_err(error).wait()
-            }
-        };
-        if let Err(error) = sent {
-            tracing::debug!(%error, "the reply could not be sent");
-        }
+            })
+        })
     }
 
     /// The encoded reply; an error names what is wrong with a request that cannot be decoded.

@@ -18,6 +18,7 @@ use synpf::{Stamp, Twist};
 
 pub use bag_player::BagPlayer;
 pub use ros2::{Ros2, Ros2Error, Ros2Options};
+pub(crate) use simulated::sensor_event;
 pub use simulated::{Incident, Race, Script, ScriptedIncident, SimulatedCar};
 
 use self::bag::SensorEvent;

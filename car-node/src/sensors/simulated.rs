@@ -188,11 +188,15 @@ impl Source for SimulatedCar {
     }
 }
 
-/// A simulator's message as the node takes it. Laps the node counts for itself.
-fn feed(race: &Race, output: Output) -> Option<Feed> {
-    Some(match output.message {
-        Message::Scan(scan) => Feed::Sensor(SensorEvent::Scan(Scan {
-            stamp: race.stamp(scan.stamp),
+/// What a sensor of a simulated car delivers, as a localizer takes it; other messages come back. `stamp` is for a time of the
+/// simulation.
+pub(crate) fn sensor_event(
+    message: Message,
+    stamp: impl Fn(Duration) -> Stamp,
+) -> Result<SensorEvent, Message> {
+    Ok(match message {
+        Message::Scan(scan) => SensorEvent::Scan(Scan {
+            stamp: stamp(scan.stamp),
             angle_min: scan.angle_min,
             angle_increment: scan.angle_increment,
             time_increment: scan.time_increment,
@@ -201,20 +205,31 @@ fn feed(race: &Race, output: Output) -> Option<Feed> {
             range_min: scan.range_min,
             range_max: scan.range_max,
             ranges: scan.ranges,
-        })),
-        Message::Odometry(odometry) => Feed::Sensor(SensorEvent::Odometry(Odometry {
-            stamp: race.stamp(odometry.stamp),
+        }),
+        Message::Odometry(odometry) => SensorEvent::Odometry(Odometry {
+            stamp: stamp(odometry.stamp),
             pose: odometry.pose,
             twist: Twist {
                 linear_x: odometry.speed,
                 linear_y: 0.0,
                 angular: odometry.yaw_rate,
             },
-        })),
-        Message::Gyro(gyro) => Feed::Sensor(SensorEvent::YawRate(YawRate {
-            stamp: race.stamp(gyro.stamp),
+        }),
+        Message::Gyro(gyro) => SensorEvent::YawRate(YawRate {
+            stamp: stamp(gyro.stamp),
             rate: gyro.yaw_rate,
-        })),
+        }),
+        other => return Err(other),
+    })
+}
+
+/// A simulator's message as the node takes it. Laps the node counts for itself.
+fn feed(race: &Race, output: Output) -> Option<Feed> {
+    let message = match sensor_event(output.message, |time| race.stamp(time)) {
+        Ok(event) => return Some(Feed::Sensor(event)),
+        Err(message) => message,
+    };
+    Some(match message {
         Message::Truth(truth) => Feed::Truth(TrueMotion {
             stamp: race.stamp(truth.stamp),
             pose: truth.pose,
@@ -232,6 +247,6 @@ fn feed(race: &Race, output: Output) -> Option<Feed> {
             pose,
             by: "recovery crew".into(),
         },
-        Message::Lap(_) => return None,
+        Message::Lap(_) | Message::Scan(_) | Message::Odometry(_) | Message::Gyro(_) => return None,
     })
 }

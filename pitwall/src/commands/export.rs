@@ -29,9 +29,9 @@ fn wanted(topic: Topic) -> bool {
     )
 }
 
-pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
-    let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
-    // This reads the whole file, so that a damaged recording leaves no files.
+/// The events of these topics, for a folder that must not exist yet. This reads the whole file, so that a damaged recording
+/// leaves no files.
+pub(super) fn events_for(file: &Path, folder: &Path, wanted: fn(Topic) -> bool) -> anyhow::Result<InOrder> {
     let events = read_in_order(file, wanted)?;
     if events.is_empty() {
         return Err(RecordingError::Empty(file.display().to_string()).into());
@@ -40,6 +40,12 @@ pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::R
         let folder = folder.display();
         return Err(BadUsage(format!("{folder} exists already; nothing is overwritten")).into());
     }
+    Ok(events)
+}
+
+pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
+    let folder = folder.unwrap_or_else(|| file.with_extension("csv"));
+    let events = events_for(file, &folder, wanted)?;
     fs::create_dir(&folder).with_context(|| folder.display().to_string())?;
     let Written {
         counts: [poses, truths, healths, laps],

@@ -6,11 +6,10 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context;
-use pitwall::{EventPayload, RecordingError, RosBag, UnreadableCount, read_in_order};
+use pitwall::{EventPayload, RosBag, UnreadableCount};
 use protocol::{CarName, Pose2, Topic};
 use serde_json::json;
 
-use super::BadUsage;
 use crate::output;
 
 /// The topics that ROS has types for.
@@ -23,15 +22,7 @@ type Bags = BTreeMap<CarName, (Option<Pose2>, Option<RosBag>)>;
 
 pub(super) fn run(file: &Path, folder: Option<PathBuf>, json: bool) -> anyhow::Result<ExitCode> {
     let folder = folder.unwrap_or_else(|| file.with_extension("bags"));
-    // This reads the whole file, so that a damaged recording leaves no files.
-    let events = read_in_order(file, wanted)?;
-    if events.is_empty() {
-        return Err(RecordingError::Empty(file.display().to_string()).into());
-    }
-    if folder.exists() {
-        let folder = folder.display();
-        return Err(BadUsage(format!("{folder} exists already; nothing is overwritten")).into());
-    }
+    let events = super::export::events_for(file, &folder, wanted)?;
     let mut bags = Bags::new();
     let mut unreadable = UnreadableCount::default();
     for event in events {

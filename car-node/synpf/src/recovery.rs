@@ -204,6 +204,10 @@ pub(crate) struct Recovery {
 /// A pose that was set or found is not doubted for so long: the particles are still contracting \[s\].
 const SETTLING: f64 = 0.25;
 
+/// Log odds of a pose that was given, against another place: one in twenty is given wrongly, and then the car may be in
+/// any of a few places.
+const GIVEN: f64 = 4.0;
+
 /// Alignment of a localized car on a map of usual quality: what the averages start from, so that a pose that was
 /// wrong from the start is doubted too.
 const USUAL: f64 = 0.8;
@@ -266,6 +270,7 @@ impl Recovery {
         self.forget();
         self.search = None;
         self.followed = 0.0;
+        self.loss.start(GIVEN);
     }
 
     /// The pose has been found by a search, which motion has confirmed.

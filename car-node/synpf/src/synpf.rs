@@ -230,6 +230,7 @@ impl SynPf {
             predicted,
             weighted,
             calibration.walls,
+            (step.motion, step.seconds),
             &parameters.refinement,
         );
         let estimate = fit.estimate;
@@ -240,7 +241,11 @@ impl SynPf {
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
         let refused = fit.refused.map(|pose| pose.since(predicted.pose));
-        self.tracker.gate.note_refused(refused, step.motion.x);
+        let since_before = (step.motion, step.seconds);
+        let acceleration = drive.acceleration.hypot(drive.lateral);
+        self.tracker
+            .gate
+            .note(refused, fit.held, since_before, acceleration);
         if !fit.held {
             self.tracker.gate.learn_fit(fit.on_walls, step.motion.x);
         }

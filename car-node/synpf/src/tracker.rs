@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::calibration::WallCalibration;
 use crate::estimate::{Estimate, carry, rotation};
-use crate::innovation_gate::InnovationGate;
+use crate::innovation_gate::{InnovationGate, Verdict};
 use crate::motion_model::MotionParameters;
 use crate::particle_filter::Weighted;
 use crate::scan_matcher::{RefinementParameters, ScanMatch, fit as share_on_walls, match_scan};
@@ -32,6 +32,37 @@ pub(crate) struct Tracker {
     predicted_with_drift: Matrix3<f64>,
     /// Which corrections are believed.
     pub(crate) gate: InnovationGate,
+    /// Odometry alone since the last scan that fitted as scans usually do.
+    reckoned: Reckoned,
+}
+
+/// An estimate that odometry carries on.
+#[derive(Debug, Clone, Copy)]
+struct Reckoned {
+    estimate: Estimate,
+    /// See [`Tracker::with_drift`].
+    with_drift: Matrix3<f64>,
+}
+
+impl Reckoned {
+    fn from(estimate: Estimate) -> Self {
+        Self {
+            estimate,
+            with_drift: Matrix3::zeros(),
+        }
+    }
+
+    /// Carries it on by `motion`, with odometry's noise.
+    fn advance(&mut self, motion: Pose, steady: &Matrix3<f64>, drift: &Drift) {
+        let Self { estimate, with_drift } = self;
+        let moved = estimate.moved(motion, steady);
+        let by = rotation(estimate.pose.heading) * drift.by;
+        let carried = carry(estimate.pose, moved.pose) * *with_drift;
+        let mixed = carried * by.transpose();
+        *with_drift = (carried + by * drift.variance) * drift.kept;
+        *estimate = moved;
+        estimate.covariance += by * drift.variance * by.transpose() + mixed + mixed.transpose();
+    }
 }
 
 /// What the fit of a scan came to.
@@ -46,6 +77,8 @@ pub(crate) struct Fit {
     pub(crate) refused: Option<Pose>,
     /// Whether the whole scan was left out for that.
     pub(crate) held: bool,
+    /// Whether the car is there whatever odometry says; see [`Verdict::Believed`].
+    pub(crate) believed: bool,
     /// Share of the end points that lie on walls there, in [0, 1].
     pub(crate) on_walls: f64,
 }
@@ -71,6 +104,9 @@ const SHORTEST: f64 = 1e-3;
 /// How far the speed of wheels that spin or lock may be off, as a share of it.
 const SPINNING_SPEED_ERROR: f64 = 0.6;
 
+/// By how much more odometry may err while tyres are near their limit, for what corrections may add up to.
+const SLIDING_FACTOR: f64 = 3.0;
+
 /// Reach at which predictions are compared by their fit \[m\].
 const FIT_REACH: f32 = 0.15;
 
@@ -89,6 +125,7 @@ impl Tracker {
             with_drift: Matrix3::zeros(),
             predicted_with_drift: Matrix3::zeros(),
             gate: InnovationGate::default(),
+            reckoned: Reckoned::from(estimate),
         }
     }
 
@@ -99,6 +136,7 @@ impl Tracker {
         self.sweep_error = Matrix3::zeros();
         self.with_drift = Matrix3::zeros();
         self.gate = InnovationGate::default();
+        self.reckoned = Reckoned::from(estimate);
     }
 
     /// The pose with what is known of its uncertainty.
@@ -126,20 +164,33 @@ impl Tracker {
         parameters: &MotionParameters,
     ) -> Estimate {
         let steady = steady_noise(motion, seconds, uncertainty, parameters);
-        let mut predicted = self.estimate.moved(motion, &steady);
-        let Drift { by, variance, kept } = Drift::new(motion, seconds, uncertainty, parameters);
-        let by = rotation(self.estimate.pose.heading) * by;
-        let carried = carry(self.estimate.pose, predicted.pose) * self.with_drift;
-        let mixed = carried * by.transpose();
-        predicted.covariance += by * variance * by.transpose() + mixed + mixed.transpose();
-        self.predicted_with_drift = (carried + by * variance) * kept;
-        predicted
+        let drift = Drift::new(motion, seconds, uncertainty, parameters);
+        if self.gate.grips() {
+            self.reckoned.advance(motion, &steady, &drift);
+        } else {
+            let sliding = Uncertainty {
+                factor: uncertainty.factor.max(SLIDING_FACTOR),
+                ..uncertainty
+            };
+            let drift = Drift::new(motion, seconds, sliding, parameters);
+            self.reckoned.advance(motion, &steady, &drift);
+        }
+        let mut own = Reckoned {
+            estimate: self.estimate,
+            with_drift: self.with_drift,
+        };
+        own.advance(motion, &steady, &drift);
+        self.predicted_with_drift = own.with_drift;
+        own.estimate
     }
 
     /// The estimate has moved on from `predicted` by a fit.
     pub(crate) fn update(&mut self, predicted: &Estimate, fit: &Fit) {
         self.estimate = fit.estimate;
         self.covariance = fit.covariance;
+        if fit.believed {
+            self.reckoned = Reckoned::from(self.posterior());
+        }
         self.with_drift = if fit.from_prediction {
             // What is left of the prediction's error, of which the scan took its share away.
             predicted
@@ -175,6 +226,7 @@ impl Tracker {
         predicted: &Estimate,
         weighted: &Weighted,
         walls: WallCalibration,
+        since_before: (Pose, f64),
         parameters: &RefinementParameters,
     ) -> Fit {
         let seen = &self.predicted_covariance(predicted);
@@ -189,9 +241,18 @@ impl Tracker {
             from_prediction,
             refused: None,
             held: false,
+            believed: true,
             on_walls,
         };
-        let passes = |found: &Estimate, on_walls| self.gate.passes(predicted, seen, found.pose, on_walls);
+        let judge = |found: &Estimate, on_walls| {
+            self.gate.judge(
+                (predicted, seen),
+                &self.reckoned.estimate,
+                found.pose,
+                on_walls,
+                since_before,
+            )
+        };
         let unchanged = |estimate: Estimate| ScanMatch {
             estimate,
             covariance: estimate.covariance,
@@ -213,8 +274,12 @@ impl Tracker {
             let from_particles = matched(&around, &covariance);
             let share = on_walls(&from_particles.estimate);
             if share > after + FIT_MARGIN {
-                if passes(&from_particles.estimate, share) {
-                    return fit(from_particles, false, share);
+                let verdict = judge(&from_particles.estimate, share);
+                if verdict != Verdict::Refused {
+                    return Fit {
+                        believed: verdict == Verdict::Believed,
+                        ..fit(from_particles, false, share)
+                    };
                 }
                 refused = Some(from_particles.estimate.pose);
             }
@@ -223,11 +288,13 @@ impl Tracker {
             estimate: *predicted,
             covariance: *seen,
         };
-        if !passes(&from_predicted.estimate, after) {
+        let verdict = judge(&from_predicted.estimate, after);
+        if verdict == Verdict::Refused {
             let refused = refused.or(Some(from_predicted.estimate.pose));
             return Fit {
                 refused,
                 held: true,
+                believed: false,
                 ..fit(kept, true, before)
             };
         }
@@ -237,7 +304,11 @@ impl Tracker {
         } else {
             fit(from_predicted, true, after)
         };
-        Fit { refused, ..fit }
+        Fit {
+            refused,
+            believed: verdict == Verdict::Believed,
+            ..fit
+        }
     }
 }
 
@@ -333,6 +404,10 @@ mod tests {
             with_drift: Matrix3::zeros(),
             predicted_with_drift: Matrix3::zeros(),
             gate: InnovationGate::default(),
+            reckoned: Reckoned::from(Estimate {
+                pose: Pose::IDENTITY,
+                covariance: Matrix3::zeros(),
+            }),
         }
     }
 
@@ -417,6 +492,7 @@ mod tests {
             from_prediction: true,
             refused: None,
             held: false,
+            believed: true,
             on_walls: 1.0,
         };
         tracker.update(&predicted, &certain);

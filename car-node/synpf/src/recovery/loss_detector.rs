@@ -123,7 +123,7 @@ impl LossDetector {
         self.contradicted_for > parameters.lost_after - 1e-3
     }
 
-    /// A pose that was found starts with these odds, one that was given with none.
+    /// A pose that was found or given starts with these odds.
     pub(crate) fn start(&mut self, odds: f64) {
         *self = Self {
             odds,

@@ -84,6 +84,7 @@ impl SynPf {
                     estimate,
                     &weighted,
                     self.calibration.walls,
+                    (Pose::IDENTITY, 0.025),
                     &parameters.refinement,
                 ));
             }

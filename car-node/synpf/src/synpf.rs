@@ -230,7 +230,6 @@ impl SynPf {
             predicted,
             weighted,
             calibration.walls,
-            (step.motion, step.seconds),
             &parameters.refinement,
         );
         let estimate = fit.estimate;
@@ -241,7 +240,7 @@ impl SynPf {
         let drive = self.odometry.drive();
         let wheel_distance = step.motion.x / (1.0 - calibration.slip_model.share(drive));
         let refused = fit.refused.map(|pose| pose.since(predicted.pose));
-        let since_before = (step.motion, step.seconds);
+        let since_before = self.tracker.since_before;
         let acceleration = drive.acceleration.hypot(drive.lateral);
         self.tracker
             .gate

@@ -32,6 +32,8 @@ pub(crate) struct Tracker {
     predicted_with_drift: Matrix3<f64>,
     /// Which corrections are believed.
     pub(crate) gate: InnovationGate,
+    /// Motion and time \[s\] of the prediction.
+    pub(crate) since_before: (Pose, f64),
     /// Odometry alone since the last scan that fitted as scans usually do.
     reckoned: Reckoned,
 }
@@ -125,6 +127,7 @@ impl Tracker {
             with_drift: Matrix3::zeros(),
             predicted_with_drift: Matrix3::zeros(),
             gate: InnovationGate::default(),
+            since_before: (Pose::IDENTITY, 0.0),
             reckoned: Reckoned::from(estimate),
         }
     }
@@ -163,6 +166,7 @@ impl Tracker {
         uncertainty: Uncertainty,
         parameters: &MotionParameters,
     ) -> Estimate {
+        self.since_before = (motion, seconds);
         let steady = steady_noise(motion, seconds, uncertainty, parameters);
         let drift = Drift::new(motion, seconds, uncertainty, parameters);
         if self.gate.grips() {
@@ -226,7 +230,6 @@ impl Tracker {
         predicted: &Estimate,
         weighted: &Weighted,
         walls: WallCalibration,
-        since_before: (Pose, f64),
         parameters: &RefinementParameters,
     ) -> Fit {
         let seen = &self.predicted_covariance(predicted);
@@ -250,7 +253,7 @@ impl Tracker {
                 &self.reckoned.estimate,
                 found.pose,
                 on_walls,
-                since_before,
+                self.since_before,
             )
         };
         let unchanged = |estimate: Estimate| ScanMatch {
@@ -404,6 +407,7 @@ mod tests {
             with_drift: Matrix3::zeros(),
             predicted_with_drift: Matrix3::zeros(),
             gate: InnovationGate::default(),
+            since_before: (Pose::IDENTITY, 0.0),
             reckoned: Reckoned::from(Estimate {
                 pose: Pose::IDENTITY,
                 covariance: Matrix3::zeros(),

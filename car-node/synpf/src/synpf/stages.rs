@@ -84,7 +84,6 @@ impl SynPf {
                     estimate,
                     &weighted,
                     self.calibration.walls,
-                    (Pose::IDENTITY, 0.025),
                     &parameters.refinement,
                 ));
             }

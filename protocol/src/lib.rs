@@ -48,6 +48,8 @@ mod telemetry;
 mod to_car;
 mod to_wall;
 
+pub mod ros;
+
 pub use codec::{CodecError, Payload, decode, encode};
 pub use geometry::{Covariance, Pose2, Twist2};
 pub use header::{Header, HeaderError, Stamps};

@@ -7,12 +7,12 @@ use std::path::Path;
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions, Writer};
-use protocol::{CarInfo, CarName, Key, Topic};
+use protocol::{CarInfo, CarName, Key, Topic, ros};
 use serde_json::json;
 use synpf::Stamp;
 
 use super::recorder::Entry;
-use super::ros_channels::{RosMessage, definition};
+use super::ros_channels::RosMessage;
 
 /// What each file begins with.
 #[derive(Debug, Clone)]
@@ -109,11 +109,8 @@ impl FileWriter {
 
     fn write_ros(&mut self, at: i64, message: &RosMessage) -> Result<(), McapError> {
         let (topic, schema) = message.channel();
-        let data = message
-            .to_cdr()
-            .map_err(|error| McapError::Io(std::io::Error::other(error)))?;
         let channel = self.channel(topic, "cdr", Some(schema))?;
-        self.write_to(channel, 0, at, &data)
+        self.write_to(channel, 0, at, &message.to_cdr())
     }
 
     fn channel(
@@ -133,7 +130,7 @@ impl FileWriter {
                 } else {
                     let schema = self
                         .writer
-                        .add_schema(name, "ros2msg", definition(name).as_bytes())?;
+                        .add_schema(name, "ros2msg", ros::definition(name).as_bytes())?;
                     self.schemas.insert(name, schema);
                     schema
                 }

@@ -88,7 +88,7 @@ runs, it listens for the cars itself: with --keys on tls/0.0.0.0:7447, with --pa
 either on this machine only.
 
 Exit codes: 0 done, 1 failed, 2 bad usage, 3 refused by the car, 4 no such car, 5 no answer in time, 6 revision conflict, \
-7 data is lost or missing.";
+7 data is lost or missing, 8 nothing is missing but what a car itself has lost (check).";
 
 #[derive(Debug, Args)]
 pub(crate) struct NetworkOptions {
@@ -276,7 +276,8 @@ pub(crate) enum Verb {
         #[arg(long, value_name = "FILE")]
         with: Vec<PathBuf>,
     },
-    /// List what each car published, what is here and what is missing, from when to when. The exit code is 0 only if nothing is.
+    /// List what each car published, what is here and what is missing, from when to when. The exit code is 0 only if nothing
+    /// is, and 8 if nothing is but what a car itself has lost when its power was cut.
     Check {
         /// The recording.
         file: PathBuf,

@@ -80,17 +80,21 @@ pub enum EventPayload {
     },
     /// The car's clock was compared with the laptop's.
     Clock {
+        /// The car's run; None where it is not known.
+        run_id: Option<u64>,
         /// Car's clock minus laptop's clock \[ns\].
         offset: i64,
         /// Round-trip time; the offset is exact to within half of it \[ns\].
         round_trip: i64,
     },
-    /// The car has answered a final sync: a recording is about to end here.
+    /// It is known how far the streams of a run go.
     StreamEnds {
         /// The car's run.
         run_id: u64,
-        /// When the car answered, by its own clock \[unix ns\].
+        /// The end, by the car's own clock \[unix ns\].
         published: i64,
+        /// How it is known.
+        end: RunEnd,
         /// The messages that have not arrived yet.
         outstanding: Vec<SentRange>,
     },
@@ -116,6 +120,19 @@ impl fmt::Display for Rejection {
             Self::Leap => "a sequence number that is far from the others",
         })
     }
+}
+
+/// How the end of a run's streams is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RunEnd {
+    /// The car has answered a final sync, as a recording ended.
+    #[default]
+    Answered,
+    /// The car has completed its own recording.
+    Recorded,
+    /// The car's own recording was cut off. What it had not brought to its disk is lost, and nobody has it.
+    CutOff,
 }
 
 /// Sequence numbers of a stream that were sent and have not been released yet.

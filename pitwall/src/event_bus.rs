@@ -171,7 +171,11 @@ impl State {
                 });
             }
             if let Some((offset, round_trip)) = car.clock() {
-                push(EventPayload::Clock { offset, round_trip });
+                push(EventPayload::Clock {
+                    run_id: None,
+                    offset,
+                    round_trip,
+                });
             }
         }
         events

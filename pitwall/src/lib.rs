@@ -63,7 +63,7 @@ pub use analysis::{
     TrackLine, ideal_lap,
 };
 pub use clock::unix_now;
-pub use event::{Delivery, EventPayload, EventSink, FleetEvent, Rejection, SentRange};
+pub use event::{Delivery, EventPayload, EventSink, FleetEvent, Rejection, RunEnd, SentRange};
 pub use event_bus::{EventBus, FleetGuard};
 pub use fleet::{
     Car, CarView, Fleet, GapSummary, HealthSample, Lap, LapGrip, Limits, Log, LogEntry, PoseView,
@@ -78,9 +78,9 @@ pub use program::program;
 pub use recording::{
     CarCheck, Check, Damage, FetchError, FetchOptions, FetchProgress, Fetched, FileSource, GapCheck, InOrder,
     Merged, MergedInput, Recorder, RecorderOptions, RecorderStatus, Recording, RecordingError,
-    RecordingProgress, RecordingSummary, Recovered, RosBag, Session, SessionIndex, SessionIndexError,
-    StreamCheck, StreamSummary, Unreadable, UnreadableCount, check, fetch, merge, missing_content,
-    read_events, read_in_order, recover, session_name,
+    RecordingProgress, RecordingSummary, Recovered, RosBag, RunCheck, Session, SessionIndex,
+    SessionIndexError, StreamCheck, StreamSummary, Unreadable, UnreadableCount, check, fetch, merge,
+    missing_content, read_events, read_in_order, recover, session_name,
 };
 pub use replay::{Replay, ReplayView};
 pub use report::{Alarm, CarReport, MeanSigma, Report, TableRow, TrueError};

@@ -15,9 +15,16 @@ impl ClockEstimate {
     /// After this time a comparison is replaced even by a less exact one, because clocks drift \[ns\].
     const MAX_AGE: i64 = 30_000_000_000;
 
-    /// True when this comparison is at least as exact as `old`, or `old` has expired.
+    /// Clocks that differ by more than this beyond their comparisons' errors were set in between \[ns\].
+    const SET: u64 = 50_000_000;
+
+    /// True when this comparison is at least as exact as `old`, or `old` has expired or contradicts it: a car that was
+    /// rebooted may have another clock.
     pub(super) fn replaces(&self, old: &Self) -> bool {
-        self.round_trip <= old.round_trip || self.at - old.at > Self::MAX_AGE
+        let error = u64::midpoint(self.round_trip.unsigned_abs(), old.round_trip.unsigned_abs());
+        self.round_trip <= old.round_trip
+            || self.at.saturating_sub(old.at) > Self::MAX_AGE
+            || self.offset.abs_diff(old.offset) > error + Self::SET
     }
 }
 
@@ -40,5 +47,21 @@ mod tests {
         assert!(exact.replaces(&rough) && !rough.replaces(&exact));
         rough.at += 1;
         assert!(rough.replaces(&exact));
+    }
+
+    // After a reboot with the clock behind, ages were an hour wrong for half a minute.
+    #[test]
+    fn a_clock_that_was_set_is_believed_at_once() {
+        let old = ClockEstimate {
+            offset: 5,
+            round_trip: 1_000,
+            at: 0,
+        };
+        let new = ClockEstimate {
+            offset: -3_600_000_000_000,
+            round_trip: 40_000_000,
+            at: 1,
+        };
+        assert!(new.replaces(&old));
     }
 }

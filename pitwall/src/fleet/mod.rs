@@ -146,7 +146,9 @@ impl Fleet {
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
                 self.add_entry(at, car, Severity::Info, "marker", text, who);
             }
-            EventPayload::Clock { offset, round_trip } => car.set_clock(*offset, *round_trip, at),
+            EventPayload::Clock {
+                offset, round_trip, ..
+            } => car.set_clock(*offset, *round_trip, at),
             EventPayload::StreamEnds { .. } => {}
         }
         self.update_link(&name.clone(), at);

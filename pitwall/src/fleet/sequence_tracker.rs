@@ -81,26 +81,21 @@ impl SequenceTracker {
         SequenceStatus::Late
     }
 
-    /// Notes that messages of the last run up to number `to` were sent. If none has arrived yet, the count begins with `from`.
+    /// Notes that messages of a run up to number `to` were sent. If none has arrived yet, the count begins with `from`.
     pub fn sent(&mut self, run_id: u64, from: u64, to: u64) {
         if to < from || from == 0 {
             return;
         }
-        let known = self.runs.iter().any(|run| run.run_id == run_id);
-        match self.runs.back_mut() {
-            Some(run) if run.run_id == run_id => {
-                if to > run.last {
-                    self.missing_before += run.miss([run.last + 1, to]);
-                    run.last = to;
-                }
-            }
-            _ if known => {}
-            _ => {
-                let run = self.begin(run_id, from);
-                run.miss([from, to]);
+        if let Some(run) = self.runs.iter_mut().rev().find(|run| run.run_id == run_id) {
+            if to > run.last {
+                self.missing_before += run.miss([run.last + 1, to]);
                 run.last = to;
             }
+            return;
         }
+        let run = self.begin(run_id, from);
+        run.miss([from, to]);
+        run.last = to;
     }
 
     /// The missing numbers, with their runs.
@@ -300,8 +295,10 @@ mod tests {
         nothing_came.sent(2, 1, 2);
         let summary = nothing_came.summary();
         assert_eq!((summary.missing, summary.sender_restarts), (4, 1));
+        nothing_came.sent(1, 1, 5);
+        assert_eq!(nothing_came.summary(), summary, "it is known already");
         nothing_came.sent(1, 1, 9);
-        assert_eq!(nothing_came.summary(), summary, "a late message of the old run");
+        assert_eq!(nothing_came.missing(), 8, "the old run had sent more");
     }
 
     #[test]

@@ -275,7 +275,7 @@ impl Client {
 
     /// Queries what runs on the car and emits it as an event. None when the car does not reply.
     pub async fn fetch_info(&self, car: &CarName) -> Option<CarInfo> {
-        let info = self
+        let (_, info) = self
             .query_message::<CarInfo>(car, Topic::Info, Vec::new(), REPLY_TIMEOUT)
             .await?;
         self.emit(car, EventPayload::Info(info.clone()));
@@ -286,11 +286,20 @@ impl Client {
     /// time \[ns\].
     pub async fn compare_clocks(&self, car: &CarName) -> Option<(i64, i64)> {
         let request = encode(&ClockRequest { sent: unix_now() }, stamps()).ok()?;
-        let reply = self
+        let (header, reply) = self
             .query_message::<ClockReply>(car, Topic::Clock, request, Duration::from_secs(1))
             .await?;
         let (offset, round_trip) = reply.offset_and_round_trip(unix_now());
-        self.emit(car, EventPayload::Clock { offset, round_trip });
+        // A car of the tests does not name its run.
+        let run_id = Some(header.run_id).filter(|run_id| *run_id > 0);
+        self.emit(
+            car,
+            EventPayload::Clock {
+                run_id,
+                offset,
+                round_trip,
+            },
+        );
         Some((offset, round_trip))
     }
 
@@ -346,11 +355,10 @@ impl Client {
         topic: Topic,
         request: Vec<u8>,
         timeout: Duration,
-    ) -> Option<M> {
+    ) -> Option<(Header, M)> {
         let bytes = first_reply(&self.session, car, topic, request, timeout, OPERATOR_PRIORITY).await?;
         decode::<M>(&bytes)
             .inspect_err(|error| tracing::debug!(%car, %error, "the reply cannot be decoded"))
-            .map(|(_, message)| message)
             .ok()
     }
 }

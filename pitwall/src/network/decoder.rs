@@ -16,7 +16,7 @@ use super::gap_recovery::{GapRecovery, MessageId, MissingQuery, Outstanding};
 use super::query::{first_reply, stamps};
 use super::run_gate::{Rejected, RunGate};
 use crate::clock::unix_now;
-use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
+use crate::event::{Delivery, EventPayload, EventSink, FleetEvent, RunEnd};
 
 /// How often overdue messages and due queries are looked for.
 const TICK: Duration = Duration::from_millis(50);
@@ -250,6 +250,7 @@ impl Decoder {
                 payload: EventPayload::StreamEnds {
                     run_id: header.run_id,
                     published: header.published,
+                    end: RunEnd::Answered,
                     outstanding,
                 },
             });

@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use super::error::RecordingError;
 use super::survey::{Gap, Survey, survey};
+use crate::event::RunEnd;
 
 /// The outcome of a check.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -16,8 +17,10 @@ pub struct Check {
     pub file: String,
     /// From the first event to the last \[s\].
     pub duration_s: f64,
-    /// True when nothing is missing of any car, and each car has confirmed how far its streams go.
+    /// True when nothing is missing of any car, and it is known how far the streams of each run go.
     pub complete: bool,
+    /// True when nothing is missing but what a car itself has lost, because its own recording was cut off.
+    pub all_there_is: bool,
     /// The cars by name.
     pub cars: Vec<CarCheck>,
 }
@@ -31,10 +34,27 @@ pub struct CarCheck {
     pub missing: u64,
     /// Share of the messages published that are here, of the streams that must be complete, in `[0, 1]`.
     pub coverage: f64,
-    /// True when the car said at the end how far its streams go. Otherwise messages after the last one may be missing.
+    /// True when it is known of each run how far its streams go. Otherwise later messages may be missing.
     pub confirmed: bool,
+    /// Its runs, in the order in which they began.
+    pub runs: Vec<RunCheck>,
     /// Its streams.
     pub streams: Vec<StreamCheck>,
+}
+
+/// One run of a car.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RunCheck {
+    /// Its id.
+    pub run_id: u64,
+    /// When its first message was published, since the recording's start \[s\].
+    pub from_s: f64,
+    /// When its last message was published.
+    pub to_s: f64,
+    /// How it is known that nothing follows; None where it is not.
+    pub end: Option<RunEnd>,
+    /// When the next run begins; None for the last one.
+    pub next_s: Option<f64>,
 }
 
 /// One stream.
@@ -92,14 +112,26 @@ pub fn check(path: &Path) -> Result<Check, RecordingError> {
     Ok(Check {
         file: path.display().to_string(),
         duration_s: (to - from) as f64 * 1e-9,
-        complete: cars.iter().all(|car| car.missing == 0 && car.confirmed),
+        complete: cars
+            .iter()
+            .all(|car| car.missing == 0 && car.confirmed && !car.lost_an_end()),
+        all_there_is: cars.iter().all(|car| car.missing == 0 && car.confirmed),
         cars,
     })
 }
 
 fn check_car(survey: &Survey, car: CarName, begin: i64) -> CarCheck {
-    let offset = survey.offset(&car).unwrap_or_default();
-    let seconds = |at: i64| at.saturating_sub(offset).saturating_sub(begin) as f64 * 1e-9;
+    let seconds = |run_id: u64, at: i64| {
+        let offset = survey.offset_in(&car, run_id);
+        at.saturating_sub(offset).saturating_sub(begin) as f64 * 1e-9
+    };
+    let runs = survey.runs(&car);
+    // What is missing before the first message of a run was published after the end of the run before it.
+    let before = |run_id: u64| {
+        let place = runs.iter().position(|run| run.run_id == run_id)?;
+        let before = runs.get(place.checked_sub(1)?)?;
+        Some(seconds(before.run_id, before.published[1]))
+    };
     let mut sent = 0_u64;
     let mut streams = Vec::new();
     for (topic, stream) in survey.of(&car) {
@@ -116,8 +148,10 @@ fn check_car(survey: &Survey, car: CarName, begin: i64) -> CarCheck {
                 run_id,
                 numbers,
                 count,
-                from_s: from.map(seconds),
-                to_s: to.map(seconds),
+                from_s: from
+                    .map(|at| seconds(run_id, at))
+                    .or_else(|| if numbers[0] == 1 { before(run_id) } else { None }),
+                to_s: to.map(|at| seconds(run_id, at)),
             },
         );
         let (received, missing) = (stream.numbers.received(), stream.numbers.missing());
@@ -138,12 +172,32 @@ fn check_car(survey: &Survey, car: CarName, begin: i64) -> CarCheck {
         });
     }
     let missing = survey.missing_content(&car);
+    let next = runs.iter().skip(1).map(Some).chain([None]);
+    let runs: Vec<_> = runs
+        .iter()
+        .zip(next)
+        .map(|(run, next)| RunCheck {
+            run_id: run.run_id,
+            from_s: seconds(run.run_id, survey.begin_of(&car, run)),
+            to_s: seconds(run.run_id, run.published[1]),
+            end: run.end,
+            next_s: next.map(|next| seconds(next.run_id, survey.begin_of(&car, next))),
+        })
+        .collect();
     CarCheck {
         missing,
         coverage: 1.0 - missing as f64 / (sent.max(1)) as f64,
-        confirmed: survey.confirmed(&car),
+        confirmed: !runs.is_empty() && runs.iter().all(|run| run.end.is_some()),
+        runs,
         streams,
         car,
+    }
+}
+
+impl CarCheck {
+    /// True when the own recording of one of its runs was cut off.
+    fn lost_an_end(&self) -> bool {
+        self.runs.iter().any(|run| run.end == Some(RunEnd::CutOff))
     }
 }
 
@@ -156,7 +210,8 @@ impl fmt::Display for Check {
         write!(f, "{}, {:.1} s: ", self.file, self.duration_s)?;
         match total {
             0 if self.complete => f.write_str("nothing is missing"),
-            0 => f.write_str("no gap, but the end is not confirmed"),
+            0 if self.all_there_is => f.write_str("nothing is missing but what the car itself has lost"),
+            0 => f.write_str("no gap, but NOT every end is known"),
             1 => f.write_str("1 message is MISSING"),
             n => write!(f, "{n} messages are MISSING"),
         }
@@ -186,13 +241,39 @@ impl fmt::Display for CarCheck {
         for stream in others {
             write!(f, "{stream}")?;
         }
-        if !self.confirmed {
-            writeln!(
-                f,
-                "  the car did not confirm the end of its streams: later messages may be missing, too"
-            )?;
+        for run in &self.runs {
+            write!(f, "{run}")?;
         }
         Ok(())
+    }
+}
+
+impl fmt::Display for RunCheck {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            run_id,
+            from_s,
+            to_s,
+            end,
+            next_s,
+        } = self;
+        write!(f, "  run {run_id}, {from_s:.3} s to {to_s:.3} s: ")?;
+        match (end, next_s) {
+            (Some(RunEnd::Answered), _) => writeln!(f, "the car has confirmed the end"),
+            (Some(RunEnd::Recorded), _) => writeln!(f, "the car's own recording confirms the end"),
+            (Some(RunEnd::CutOff), _) => writeln!(
+                f,
+                "the car was cut off; what it had not brought to its disk then, a second at most, is lost"
+            ),
+            (None, Some(next)) => writeln!(
+                f,
+                "the end is NOT known: messages between {to_s:.3} s and {next:.3} s may be missing, too"
+            ),
+            (None, None) => writeln!(
+                f,
+                "the end is NOT known: messages after {to_s:.3} s may be missing, too"
+            ),
+        }
     }
 }
 

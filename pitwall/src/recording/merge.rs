@@ -4,6 +4,9 @@
 //! arrived. What only the car has gets the time at which it was published, by the laptop's clock: the laptop's recording has the
 //! difference between the clocks. It stays between its neighbours, so that each stream is in order.
 //!
+//! Of each run of a car the new file says how far its streams go, and how that is known: the car has answered a laptop, or its
+//! own recording is completed, or that was cut off, so that nobody has what followed.
+//!
 //! Two passes: the first notes which numbers each recording has, and the clocks. The second merges by time, with a few hundred
 //! messages of each file in memory.
 
@@ -21,13 +24,16 @@ use super::fetch::PART;
 use super::reader::{Recording, read_intact};
 use super::summary::RecordingSummary;
 use super::writer::RecordingWriter;
-use crate::event::{EventPayload, FleetEvent};
+use crate::event::{EventPayload, FleetEvent, RunEnd};
 
 /// Clocks whose difference changes by more than one part in so many were set in between.
 const STEADY: u64 = 100;
 
 /// Messages of one file in memory.
 const AHEAD: usize = 512;
+
+/// What a car had sent this long after the end of its own recording may not have reached its disk \[ns\].
+const UNSYNCED: i64 = 1_500_000_000;
 
 /// The result of a merge.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -75,7 +81,7 @@ pub fn merge(inputs: &[PathBuf], to: &Path) -> Result<Merged, RecordingError> {
         let files: Vec<_> = inputs.iter().map(|path| path.display().to_string()).collect();
         return Err(RecordingError::Empty(files.join(", ")));
     }
-    known.end_of_scans();
+    known.end_of_scans(&scans);
     let output = OpenOptions::new()
         .write(true)
         .create_new(true)
@@ -114,8 +120,11 @@ struct Known {
     received: BTreeMap<Stream, Received>,
     /// Cars that a laptop has recorded.
     at_the_wall: BTreeSet<CarName>,
-    /// Clock comparisons by car: the car's time, and the car's clock minus the laptop's \[ns\], ascending.
-    clocks: BTreeMap<CarName, Vec<(i64, i64)>>,
+    /// Clock comparisons of each run: the car's time, and the car's clock minus the laptop's \[ns\], ascending. A clock may be
+    /// another one after a reboot.
+    clocks: BTreeMap<CarName, BTreeMap<u64, Vec<(i64, i64)>>>,
+    /// The runs that no laptop has heard.
+    unheard: BTreeSet<(CarName, u64)>,
 }
 
 /// The numbers that were received of one stream.
@@ -191,6 +200,57 @@ struct Scan {
     /// When its first event happened, by the clock of whoever recorded it; None without events.
     first: Option<(CarName, i64)>,
     messages: u64,
+    /// The runs in it, by car.
+    runs: BTreeMap<(CarName, u64), RunScan>,
+    /// The run that it begins with, by car.
+    first_run: BTreeMap<CarName, u64>,
+    /// True for a file with its end.
+    complete: bool,
+}
+
+/// A run in one input.
+struct RunScan {
+    /// When its first and its last message were published, by the car's clock \[unix ns\].
+    published: [i64; 2],
+    /// The end as this file knows it, by the car's clock.
+    end: Option<(i64, RunEnd)>,
+}
+
+impl Scan {
+    fn add_message(&mut self, car: &CarName, run_id: u64, published: i64) {
+        /// Beyond this many, runs are left out.
+        const MOST: usize = 10_000;
+        self.messages += 1;
+        if !self.first_run.contains_key(car) {
+            self.first_run.insert(car.clone(), run_id);
+        }
+        if let Some(run) = self.runs.get_mut(&(car.clone(), run_id)) {
+            let [from, to] = run.published;
+            run.published = [from.min(published), to.max(published)];
+        } else if self.runs.len() < MOST {
+            let run = RunScan {
+                published: [published; 2],
+                end: None,
+            };
+            self.runs.insert((car.clone(), run_id), run);
+        }
+    }
+
+    /// The report of this input before anything is added.
+    fn report(&self) -> MergedInput {
+        MergedInput {
+            file: self.path.clone(),
+            on_car: self.on_car,
+            messages: self.messages,
+            added: 0,
+            damage: Vec::new(),
+        }
+    }
+
+    /// True for a file that is still being fetched: its car records on.
+    fn grows(&self) -> bool {
+        self.path.extension().is_some_and(|end| end == PART)
+    }
 }
 
 impl Known {
@@ -199,15 +259,22 @@ impl Known {
             on_car: false,
             first: None,
             messages: 0,
+            runs: BTreeMap::new(),
+            first_run: BTreeMap::new(),
+            complete: false,
             path,
         };
+        let mut last_run = BTreeMap::new();
         let mut events = read_intact(&scan.path)?;
         while let Some(event) = events.next() {
             let event = event?;
             scan.on_car = events.library().starts_with(super::CAR_LIBRARY);
             scan.first.get_or_insert_with(|| (event.car.clone(), event.at));
-            if let EventPayload::Message { .. } = &event.payload {
-                scan.messages += 1;
+            if let EventPayload::Message { header, .. } = &event.payload {
+                scan.add_message(&event.car, header.run_id, header.published);
+                if last_run.get(&event.car) != Some(&header.run_id) {
+                    last_run.insert(event.car.clone(), header.run_id);
+                }
             }
             if scan.on_car {
                 continue;
@@ -221,27 +288,163 @@ impl Known {
                         .or_default()
                         .insert(header.sequence, event.at);
                 }
-                EventPayload::Clock { offset, .. } => {
+                EventPayload::Clock { run_id, offset, .. } => {
+                    let run_id = run_id.or_else(|| last_run.get(&event.car).copied());
                     let clocks = self.clocks.entry(event.car.clone()).or_default();
-                    clocks.push((event.at.saturating_add(*offset), *offset));
+                    clocks
+                        .entry(run_id.unwrap_or_default())
+                        .or_default()
+                        .push((event.at.saturating_add(*offset), *offset));
+                }
+                EventPayload::StreamEnds {
+                    run_id,
+                    published,
+                    end,
+                    ..
+                } => {
+                    if let Some(run) = scan.runs.get_mut(&(event.car.clone(), *run_id)) {
+                        run.end = Some((*published, *end));
+                    }
                 }
                 _ => {}
             }
         }
+        scan.complete = events.complete();
         Ok(scan)
     }
 
-    fn end_of_scans(&mut self) {
-        for clocks in self.clocks.values_mut() {
+    fn end_of_scans(&mut self, scans: &[Scan]) {
+        for clocks in self.clocks.values_mut().flat_map(BTreeMap::values_mut) {
             clocks.sort_unstable();
         }
+        let cars: BTreeSet<_> = scans
+            .iter()
+            .flat_map(|scan| scan.runs.keys())
+            .map(|(car, _)| car)
+            .collect();
+        for car in cars {
+            self.place_unheard(car, scans);
+        }
+    }
+
+    /// Gives the runs of a car that no laptop has heard a clock. The one of the neighbouring run may be another: then the run is
+    /// placed right behind the run before it, in the order of the car's files.
+    fn place_unheard(&mut self, car: &CarName, scans: &[Scan]) {
+        let mut runs: Vec<(u64, [i64; 2])> = Vec::new();
+        for scan in scans.iter().filter(|scan| scan.on_car) {
+            for ((_, run_id), run) in scan.runs.iter().filter(|((name, _), _)| name == car) {
+                let [from, to] = run.published;
+                match runs.iter_mut().find(|(known, _)| known == run_id) {
+                    Some((_, [first, last])) => (*first, *last) = (from.min(*first), to.max(*last)),
+                    None => runs.push((*run_id, run.published)),
+                }
+            }
+        }
+        let known = |known: &Self, run_id: u64| {
+            let clocks = known.clocks.get(car);
+            clocks.is_some_and(|clocks| clocks.contains_key(&run_id))
+        };
+        if !runs.iter().any(|(run_id, _)| known(self, *run_id)) {
+            return;
+        }
+        for place in 0..runs.len() {
+            let (run_id, [from, to]) = runs[place];
+            if known(self, run_id) {
+                continue;
+            }
+            let before = place.checked_sub(1).map(|before| {
+                let (before, [_, last]) = runs[before];
+                self.by_the_laptop(car, before, last)
+            });
+            let after = runs[place + 1..].iter().find(|(run_id, _)| known(self, *run_id));
+            let after = after.map(|(after, [first, _])| self.by_the_laptop(car, *after, *first));
+            let same = from.saturating_sub(self.by_the_laptop(car, run_id, from));
+            let fits = before.is_none_or(|before| from.saturating_sub(same) >= before)
+                && after.is_none_or(|after| to.saturating_sub(same) <= after);
+            let offset = match (fits, before, after) {
+                (false, Some(before), _) => from.saturating_sub(before),
+                (false, None, Some(after)) => to.saturating_sub(after),
+                _ => same,
+            };
+            let clocks = self.clocks.entry(car.clone()).or_default();
+            clocks.insert(run_id, vec![(from, offset)]);
+            self.unheard.insert((car.clone(), run_id));
+        }
+    }
+
+    /// The clock of a run that no laptop has heard, with its first message.
+    fn clock_of(
+        &self,
+        event: &FleetEvent,
+        run_id: u64,
+        known: &mut BTreeSet<(CarName, u64)>,
+    ) -> Option<FleetEvent> {
+        /// It is a guess: any comparison is better \[ns\].
+        const GUESS: i64 = 10_000_000_000;
+        let key = (event.car.clone(), run_id);
+        if known.contains(&key) || !self.unheard.contains(&key) {
+            return None;
+        }
+        known.insert(key);
+        let (_, offset) = *self.clocks.get(&event.car)?.get(&run_id)?.first()?;
+        Some(FleetEvent {
+            at: event.at,
+            car: event.car.clone(),
+            payload: EventPayload::Clock {
+                run_id: Some(run_id),
+                offset,
+                round_trip: GUESS,
+            },
+        })
+    }
+
+    /// The ends of all runs that are known.
+    fn ends(&self, scans: &[Scan]) -> Vec<FleetEvent> {
+        let mut runs = BTreeMap::<_, (i64, Vec<&Scan>)>::new();
+        for scan in scans {
+            for ((car, run_id), run) in &scan.runs {
+                let begin = self.by_the_laptop(car, *run_id, run.published[0]);
+                let (first, inputs) = runs.entry((car, *run_id)).or_insert((begin, Vec::new()));
+                *first = begin.min(*first);
+                inputs.push(scan);
+            }
+        }
+        let mut newest = BTreeMap::<&CarName, i64>::new();
+        for ((car, _), (begin, _)) in &runs {
+            let newest = newest.entry(car).or_insert(*begin);
+            *newest = *begin.max(newest);
+        }
+        let mut ends = Vec::new();
+        for ((car, run_id), (begin, inputs)) in &runs {
+            let ended = newest.get(car).is_some_and(|newest| newest > begin);
+            if let Some((published, end)) = end_of_run(car, *run_id, inputs, ended) {
+                ends.push(FleetEvent {
+                    at: self.by_the_laptop(car, *run_id, published),
+                    car: (*car).clone(),
+                    payload: EventPayload::StreamEnds {
+                        run_id: *run_id,
+                        published,
+                        end,
+                        outstanding: Vec::new(),
+                    },
+                });
+            }
+        }
+        ends.sort_by_key(|event| event.at);
+        ends
     }
 
     /// A time of the car's clock by the laptop's: between two comparisons their differences go over into each other, so that
     /// the order of times stays. Where the clock was set between them, the nearer one counts.
-    fn by_the_laptop(&self, car: &CarName, at: i64) -> i64 {
-        let Some(clocks) = self.clocks.get(car) else {
+    fn by_the_laptop(&self, car: &CarName, run_id: u64, at: i64) -> i64 {
+        let Some(runs) = self.clocks.get(car) else {
             return at;
+        };
+        let Some(clocks) = runs.get(&run_id) else {
+            // The nearest comparison of another run.
+            let all = runs.values().flatten();
+            let nearest = all.min_by_key(|(time, _)| time.abs_diff(at));
+            return at.saturating_sub(nearest.map_or(0, |(_, offset)| *offset));
         };
         let next = clocks.partition_point(|(time, _)| *time < at);
         let before = next.checked_sub(1).and_then(|index| clocks.get(index));
@@ -273,8 +476,8 @@ struct Input<'a> {
     /// Events in memory, the earliest first.
     waiting: BinaryHeap<Reverse<Waiting>>,
     count: u64,
-    /// The last message of a car's file.
-    last: Option<Last>,
+    /// The run that a car's file begins with, by car.
+    first_run: &'a BTreeMap<CarName, u64>,
 }
 
 /// An event, ordered by time and then by its place in the file.
@@ -331,16 +534,12 @@ impl Input<'_> {
         if !self.on_car {
             return Some(event);
         }
-        let at = self.known.by_the_laptop(&event.car, event.at);
+        let run_id = match &event.payload {
+            EventPayload::Message { header, .. } => header.run_id,
+            _ => self.first_run.get(&event.car).copied().unwrap_or_default(),
+        };
+        let at = self.known.by_the_laptop(&event.car, run_id, event.at);
         event.at = at;
-        if let EventPayload::Message { header, .. } = &event.payload {
-            self.last = Some(Last {
-                at,
-                car: event.car.clone(),
-                run_id: header.run_id,
-                published: header.published,
-            });
-        }
         let wanted = match &event.payload {
             EventPayload::Message { topic, header, .. } => {
                 let stream = (event.car.clone(), *topic, header.run_id);
@@ -361,66 +560,47 @@ impl Input<'_> {
     }
 }
 
-/// The last message of a car's file, at its time by the laptop's clock.
-struct Last {
-    at: i64,
-    car: CarName,
-    run_id: u64,
-    published: i64,
-}
-
-/// How far the streams of each car go.
-#[derive(Default)]
-struct Ends {
-    /// What a car answered at the end of a laptop's recording, the last of each car.
-    at_the_wall: BTreeMap<CarName, FleetEvent>,
-    /// The end of each car's own recording, and whether that was completed.
-    on_car: BTreeMap<CarName, (Last, bool)>,
-}
-
-impl Ends {
-    fn at_the_wall(&mut self, event: FleetEvent) {
-        let known = self.at_the_wall.get(&event.car);
-        if known.is_none_or(|known| known.at <= event.at) {
-            self.at_the_wall.insert(event.car.clone(), event);
+/// How far the streams of a run go, by the car's clock \[unix ns\], and how that is known. `ended` is true when another run follows.
+fn end_of_run(car: &CarName, run_id: u64, inputs: &[&Scan], ended: bool) -> Option<(i64, RunEnd)> {
+    let key = (car.clone(), run_id);
+    let mut at_the_wall: Option<(i64, Option<RunEnd>)> = None;
+    let mut on_car: Option<(i64, &Scan)> = None;
+    for scan in inputs {
+        let Some(run) = scan.runs.get(&key) else {
+            continue;
+        };
+        if scan.on_car {
+            if on_car.is_none_or(|(until, _)| until <= run.published[1]) {
+                on_car = Some((run.published[1], scan));
+            }
+            continue;
+        }
+        let (until, end) = match run.end {
+            Some((until, end)) => (until, Some(end)),
+            None => (run.published[1], None),
+        };
+        if at_the_wall.is_none_or(|(known, _)| known <= until) {
+            at_the_wall = Some((until, end));
         }
     }
-
-    fn file_ended(&mut self, last: Option<Last>, complete: bool) {
-        if let Some(last) = last
-            && self
-                .on_car
-                .get(&last.car)
-                .is_none_or(|(known, _)| known.at <= last.at)
-        {
-            self.on_car.insert(last.car.clone(), (last, complete));
-        }
+    let answer = at_the_wall.and_then(|(until, end)| Some((until, end?)));
+    let Some((until, file)) = on_car else {
+        return answer;
+    };
+    if answer.is_some_and(|(answered, _)| answered >= until) {
+        return answer;
     }
-
-    /// The ends that are certain. A car that has completed its recording has said how far it goes.
-    fn last(mut self) -> Vec<FleetEvent> {
-        for (car, (last, complete)) in self.on_car {
-            let before = self
-                .at_the_wall
-                .get(&car)
-                .is_some_and(|event| event.at >= last.at);
-            if before {
-                continue;
-            }
-            // Without a completed file it is not certain that nothing followed.
-            self.at_the_wall.remove(&car);
-            if complete {
-                let payload = EventPayload::StreamEnds {
-                    run_id: last.run_id,
-                    published: last.published,
-                    outstanding: Vec::new(),
-                };
-                let at = last.at;
-                self.at_the_wall
-                    .insert(car.clone(), FleetEvent { at, car, payload });
-            }
-        }
-        self.at_the_wall.into_values().collect()
+    let reaches = at_the_wall.is_none_or(|(seen, _)| seen <= until.saturating_add(UNSYNCED));
+    if !reaches {
+        // The recording on the car had ended before.
+        return answer;
+    }
+    if file.complete {
+        Some((until, RunEnd::Recorded))
+    } else if ended || !file.grows() {
+        Some((until, RunEnd::CutOff))
+    } else {
+        answer
     }
 }
 
@@ -429,7 +609,8 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
     let begin = |scan: &Scan| {
         let (car, at) = scan.first.as_ref()?;
         Some(if scan.on_car {
-            known.by_the_laptop(car, *at)
+            let run_id = scan.first_run.get(car).copied().unwrap_or_default();
+            known.by_the_laptop(car, run_id, *at)
         } else {
             *at
         })
@@ -437,23 +618,14 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
     scans.sort_by_key(|scan| (begin(scan), scan.on_car));
     let sync = output.try_clone().map_err(|e| RecordingError::io(to, e))?;
     let mut writer = RecordingWriter::new(BufWriter::new(output)).map_err(mcap)?;
-    let mut report: Vec<_> = scans
-        .iter()
-        .map(|scan| MergedInput {
-            file: scan.path.clone(),
-            on_car: scan.on_car,
-            messages: scan.messages,
-            added: 0,
-            damage: Vec::new(),
-        })
-        .collect();
+    let mut report: Vec<_> = scans.iter().map(Scan::report).collect();
     // A file is opened when its time has come: a session on a car is hundreds of files.
     let mut closed: Vec<_> = scans.iter().enumerate().rev().collect();
     let mut open: Vec<(usize, Input<'_>)> = Vec::new();
     let mut written = 0;
     // What each car's first file begins with is enough.
     let mut introduced = HashSet::new();
-    let mut ends = Ends::default();
+    let mut clocked = BTreeSet::new();
     loop {
         let earliest = open.iter().filter_map(|(_, input)| input.next_at()).min();
         if let Some((_, scan)) = closed.last()
@@ -467,7 +639,7 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
                 ended: false,
                 waiting: BinaryHeap::new(),
                 count: 0,
-                last: None,
+                first_run: &scan.first_run,
             };
             input.fill()?;
             open.push((index, input));
@@ -490,15 +662,11 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
             let ended = input.next_at().is_none();
             if ended {
                 report[*index].damage = input.events.damage().to_vec();
-                if input.on_car {
-                    ends.file_ended(input.last.take(), input.events.complete());
-                }
             }
             !ended
         });
         if let EventPayload::StreamEnds { .. } = event.payload {
             // What follows in other recordings is wanted, too.
-            ends.at_the_wall(event);
             continue;
         }
         let message = matches!(event.payload, EventPayload::Message { .. });
@@ -508,6 +676,13 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
         {
             continue;
         }
+        if on_car
+            && let EventPayload::Message { header, .. } = &event.payload
+            && let Some(clock) = known.clock_of(&event, header.run_id, &mut clocked)
+        {
+            writer.write(&clock).map_err(mcap)?;
+            written = writer.messages();
+        }
         writer.write(&event).map_err(mcap)?;
         let total = writer.messages();
         if message && total > written {
@@ -515,7 +690,7 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
         }
         written = total;
     }
-    for end in ends.last() {
+    for end in known.ends(&scans) {
         writer.write(&end).map_err(mcap)?;
     }
     let (mut summary, writer) = writer.finish().map_err(mcap)?;
@@ -533,7 +708,7 @@ fn write(known: &Known, mut scans: Vec<Scan>, output: fs::File, to: &Path) -> Re
 mod tests {
     use super::*;
     use crate::event::Delivery;
-    use crate::recording::read_events;
+    use crate::recording::{check, read_events};
     use mcap::WriteOptions;
     use mcap::records::MessageHeader;
     use proptest::prelude::*;
@@ -565,7 +740,12 @@ mod tests {
 
     /// A message of the laptop, which it got a tenth of a second after it was published. `at` is the laptop's time.
     fn received(run_id: u64, sequence: u64, at: i64) -> FleetEvent {
-        let bytes = bytes(run_id, sequence, at + OFFSET);
+        received_by(OFFSET, run_id, sequence, at)
+    }
+
+    /// The same, by a car's clock.
+    fn received_by(offset: i64, run_id: u64, sequence: u64, at: i64) -> FleetEvent {
+        let bytes = bytes(run_id, sequence, at + offset);
         let (header, event) = decode::<Event>(&bytes).expect("our own");
         FleetEvent {
             at: at + SECOND / 10,
@@ -587,6 +767,7 @@ mod tests {
                 at: 0,
                 car: car(),
                 payload: EventPayload::Clock {
+                    run_id: Some(7),
                     offset: OFFSET,
                     round_trip: 0,
                 },
@@ -709,17 +890,19 @@ mod tests {
     #[test]
     fn times_stay_in_order_between_two_comparisons_of_clocks() {
         let mut known = Known::default();
-        known.clocks.insert(car(), vec![(0, 0), (SECOND, 2_000_000)]);
+        known
+            .clocks
+            .insert(car(), [(7, vec![(0, 0), (SECOND, 2_000_000)])].into());
         let times: Vec<_> = (0..=1100)
-            .map(|ms| known.by_the_laptop(&car(), ms * 1_000_000))
+            .map(|ms| known.by_the_laptop(&car(), 7, ms * 1_000_000))
             .collect();
         assert!(times.windows(2).all(|pair| pair[0] < pair[1]));
         assert_eq!([times[500], times[1100]], [499_000_000, 1_098_000_000]);
         // A clock that was set: there is nothing between.
         known
             .clocks
-            .insert(car(), vec![(0, 0), (3601 * SECOND, 3600 * SECOND)]);
-        let at = |seconds: i64| known.by_the_laptop(&car(), seconds * SECOND);
+            .insert(car(), [(7, vec![(0, 0), (3601 * SECOND, 3600 * SECOND)])].into());
+        let at = |seconds: i64| known.by_the_laptop(&car(), 7, seconds * SECOND);
         assert_eq!([at(1), at(3600)], [SECOND, 0]);
     }
 
@@ -743,6 +926,133 @@ mod tests {
             .collect();
         assert_eq!(numbers(&path("merged")), expected);
         assert_eq!(merged.summary.missing(), 0);
+    }
+
+    fn answered(run_id: u64, at: i64) -> FleetEvent {
+        FleetEvent {
+            at,
+            car: car(),
+            payload: EventPayload::StreamEnds {
+                run_id,
+                published: at + OFFSET,
+                end: RunEnd::Answered,
+                outstanding: Vec::new(),
+            },
+        }
+    }
+
+    /// Removes the summary and the end mark of a file.
+    fn cut_off(path: &Path) {
+        let bytes = fs::read(path).expect("read");
+        fs::write(path, &bytes[..bytes.len() - 300]).expect("written");
+    }
+
+    // A car that died while the link was cut, and was back before the end, was once called complete.
+    #[test]
+    fn the_end_of_each_run_is_known_or_the_recording_is_not_complete() {
+        for is_cut_off in [true, false] {
+            let folder = tempfile::tempdir().expect("a folder");
+            let path = |name: &str| folder.path().join(name);
+            let first = (1..=10).map(|number| received(7, number, at(number)));
+            let second = (1..=10).map(|number| received(8, number, at(20 + number)));
+            let events = first.chain(second).chain([answered(8, at(31))]);
+            laptop(&path("laptop.mcap"), events);
+            let before = check(&path("laptop.mcap")).expect("a recording");
+            assert!(!before.complete && !before.all_there_is, "{before}");
+            let [old, new] = &before.cars[0].runs[..] else {
+                panic!("two runs: {before}")
+            };
+            assert_eq!((old.run_id, old.end), (7, None));
+            let hole = old.next_s.expect("the next run") - old.to_s;
+            assert!((hole - 11.0).abs() < 1e-6, "{hole}");
+            assert_eq!((new.run_id, new.end), (8, Some(RunEnd::Answered)));
+            assert!(before.to_string().contains("the end is NOT known"), "{before}");
+
+            on_car(&path("a.mcap"), (1..=15).map(|number| (7, number, at(number))));
+            if is_cut_off {
+                cut_off(&path("a.mcap"));
+            }
+            on_car(
+                &path("b.mcap"),
+                (1..=10).map(|number| (8, number, at(20 + number))),
+            );
+            merge(&[folder.path().to_owned()], &path("merged")).expect("merged");
+            let after = check(&path("merged")).expect("a recording");
+            let end = if is_cut_off {
+                RunEnd::CutOff
+            } else {
+                RunEnd::Recorded
+            };
+            let ends: Vec<_> = after.cars[0].runs.iter().map(|run| run.end).collect();
+            assert_eq!(ends, [Some(end), Some(RunEnd::Answered)], "{after}");
+            assert_eq!((after.complete, after.all_there_is), (!is_cut_off, true));
+            // A merged file can be merged again.
+            merge(&[path("merged"), path("b.mcap")], &path("again")).expect("merged");
+            let again = check(&path("again")).expect("a recording");
+            assert_eq!(
+                (again.complete, again.all_there_is),
+                (after.complete, after.all_there_is)
+            );
+        }
+    }
+
+    #[test]
+    fn a_recording_on_the_car_that_ended_before_says_nothing_about_the_end() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = |name: &str| folder.path().join(name);
+        laptop(
+            &path("laptop.mcap"),
+            (1..=30).map(|number| received(7, number, at(number))),
+        );
+        on_car(&path("a.mcap"), (1..=15).map(|number| (7, number, at(number))));
+        merge(&[folder.path().to_owned()], &path("merged")).expect("merged");
+        let check = check(&path("merged")).expect("a recording");
+        assert!(!check.all_there_is, "{check}");
+    }
+
+    // Without a battery, a car's clock is behind after a power cut. Its messages once stood an hour too early.
+    #[test]
+    fn runs_with_other_clocks_stand_one_after_the_other() {
+        const BEHIND: i64 = 3600 * SECOND;
+        for (behind, exact) in [(BEHIND, true), (2 * BEHIND, false)] {
+            let folder = tempfile::tempdir().expect("a folder");
+            let path = |name: &str| folder.path().join(name);
+            let first = (1..=10).map(|number| received(7, number, at(number)));
+            let clock = FleetEvent {
+                at: at(45),
+                car: car(),
+                payload: EventPayload::Clock {
+                    run_id: Some(9),
+                    offset: OFFSET - BEHIND,
+                    round_trip: 0,
+                },
+            };
+            let third = (5..=10).map(|number| received_by(OFFSET - BEHIND, 9, number, at(40 + number)));
+            laptop(&path("laptop.mcap"), first.chain([clock]).chain(third));
+            on_car(
+                &path("000001.mcap"),
+                (1..=15).map(|number| (7, number, at(number))),
+            );
+            on_car(
+                &path("000002.mcap"),
+                (1..=5).map(|number| (8, number, at(20 + number) - behind)),
+            );
+            on_car(
+                &path("000003.mcap"),
+                (1..=12).map(|number| (9, number, at(40 + number) - BEHIND)),
+            );
+            merge(&[folder.path().to_owned()], &path("merged")).expect("merged");
+            let content = content(&path("merged"));
+            let runs: Vec<_> = content.iter().map(|(run, ..)| *run).collect();
+            assert!(runs.is_sorted() && runs.len() == 15 + 5 + 12, "{content:?}");
+            assert!(content.is_sorted_by_key(|(_, _, at)| *at), "{content:?}");
+            let of_the_second = |(run, number, _): &&(u64, u64, i64)| (*run, *number) == (8, 1);
+            let (_, _, second) = content.iter().find(of_the_second).expect("its first message");
+            assert_eq!(*second, if exact { at(21) } else { at(15) });
+            let check = check(&path("merged")).expect("a recording");
+            let begin: Vec<_> = check.cars[0].runs.iter().map(|run| run.from_s).collect();
+            assert!(begin.is_sorted() && begin[2] - begin[0] < 60.0, "{check}");
+        }
     }
 
     #[test]

@@ -39,7 +39,7 @@ mod writer;
 /// What the car's program calls itself at the start of its files.
 const CAR_LIBRARY: &str = "car-node";
 
-pub use check::{CarCheck, Check, GapCheck, StreamCheck, check};
+pub use check::{CarCheck, Check, GapCheck, RunCheck, StreamCheck, check};
 pub use error::RecordingError;
 pub use fetch::{FetchError, FetchOptions, FetchProgress, Fetched, FileSource, fetch};
 pub use merge::{Merged, MergedInput, merge};

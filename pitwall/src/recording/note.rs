@@ -5,7 +5,7 @@ use std::sync::Arc;
 use protocol::{CarInfo, CarName, Header, Topic};
 use serde::{Deserialize, Serialize};
 
-use crate::event::{EventPayload, Rejection, SentRange};
+use crate::event::{EventPayload, Rejection, RunEnd, SentRange};
 
 /// An event that is not a message.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -27,16 +27,21 @@ pub(super) enum Note {
         count: u64,
         reason: Rejection,
     },
-    /// The car answered the final sync.
     StreamEnds {
         run_id: u64,
         published: i64,
+        /// Older recordings have none.
+        #[serde(default)]
+        end: RunEnd,
         outstanding: Vec<SentRange>,
     },
     Info {
         info: CarInfo,
     },
     Clock {
+        /// Older recordings have none.
+        #[serde(default)]
+        run_id: Option<u64>,
         offset: i64,
         round_trip: i64,
     },
@@ -88,7 +93,12 @@ impl Note {
                 reason: *reason,
             },
             EventPayload::Info(info) => Self::Info { info: info.clone() },
-            EventPayload::Clock { offset, round_trip } => Self::Clock {
+            EventPayload::Clock {
+                run_id,
+                offset,
+                round_trip,
+            } => Self::Clock {
+                run_id: *run_id,
                 offset: *offset,
                 round_trip: *round_trip,
             },
@@ -99,10 +109,12 @@ impl Note {
             EventPayload::StreamEnds {
                 run_id,
                 published,
+                end,
                 outstanding,
             } => Self::StreamEnds {
                 run_id: *run_id,
                 published: *published,
+                end: *end,
                 outstanding: outstanding.clone(),
             },
             EventPayload::Message { .. } | EventPayload::Map { .. } => return None,
@@ -132,14 +144,24 @@ impl From<Note> for EventPayload {
             Note::StreamEnds {
                 run_id,
                 published,
+                end,
                 outstanding,
             } => Self::StreamEnds {
                 run_id,
                 published,
+                end,
                 outstanding,
             },
             Note::Info { info } => Self::Info(info),
-            Note::Clock { offset, round_trip } => Self::Clock { offset, round_trip },
+            Note::Clock {
+                run_id,
+                offset,
+                round_trip,
+            } => Self::Clock {
+                run_id,
+                offset,
+                round_trip,
+            },
             Note::Marker { who, text } => Self::Marker {
                 who: Arc::from(who),
                 text: Arc::from(text),

@@ -36,8 +36,8 @@ pub struct InOrder {
     events: Recording,
     newest: Newest,
     late: BTreeMap<(CarName, u64), VecDeque<Late>>,
-    /// The car's clock minus the laptop's \[ns\].
-    offsets: BTreeMap<CarName, i64>,
+    /// The car's clock minus the laptop's in each of its runs \[ns\].
+    offsets: BTreeMap<(CarName, u64), i64>,
     ready: VecDeque<FleetEvent>,
     ended: bool,
     copies: bool,
@@ -137,9 +137,9 @@ impl InOrder {
             }
             let Some(event) = self.events.next().transpose()? else {
                 self.ended = true;
-                for ((car, _), messages) in std::mem::take(&mut self.late) {
+                for (run, messages) in std::mem::take(&mut self.late) {
                     for late in messages {
-                        let event = self.event_of(&car, &late, i64::MAX);
+                        let event = self.event_of(&run, &late, i64::MAX);
                         self.ready.extend(event);
                     }
                 }
@@ -150,8 +150,13 @@ impl InOrder {
     }
 
     fn add(&mut self, mut event: FleetEvent) {
-        if let EventPayload::Clock { offset, .. } = event.payload {
-            self.offsets.insert(event.car.clone(), offset);
+        if let EventPayload::Clock {
+            run_id: Some(run_id),
+            offset,
+            ..
+        } = event.payload
+        {
+            self.offsets.insert((event.car.clone(), run_id), offset);
         }
         let Some((topic, header, _)) = message(&event) else {
             self.ready.push_back(event);
@@ -173,31 +178,33 @@ impl InOrder {
             .get_mut(&key)
             .and_then(|late| late.pop_front_if(|late| late.published < published))
         {
-            let event = self.event_of(&key.0, &late, event.at);
+            let event = self.event_of(&key, &late, event.at);
             self.ready.extend(event);
         }
-        event.at = self.time_of(&event.car, published, event.at);
+        event.at = self.time_of(&key, published, event.at);
         self.ready.push_back(event);
     }
 
     /// When a message would have arrived on a good link, by the laptop's clock \[unix ns\]: never after it did.
-    fn time_of(&self, car: &CarName, published: i64, arrived: i64) -> i64 {
+    fn time_of(&self, run: &(CarName, u64), published: i64, arrived: i64) -> i64 {
         /// A car does not keep its messages for longer \[ns\].
         const KEPT: i64 = 6 * 3600 * 1_000_000_000;
-        match self.offsets.get(car) {
+        let (car, run_id) = run;
+        let offset = self.offsets.get(run).copied();
+        match offset.or_else(|| self.survey.compared(car, *run_id)) {
             Some(offset) => published
-                .saturating_sub(*offset)
+                .saturating_sub(offset)
                 .clamp(arrived.saturating_sub(KEPT), arrived),
             None => arrived,
         }
     }
 
     /// The event of a late message that stands before an event of the time `before` \[unix ns\].
-    fn event_of(&self, car: &CarName, late: &Late, before: i64) -> Option<FleetEvent> {
+    fn event_of(&self, run: &(CarName, u64), late: &Late, before: i64) -> Option<FleetEvent> {
         let before = before.min(self.survey.span.map_or(i64::MAX, |(_, to)| to));
         Some(FleetEvent {
-            at: self.time_of(car, late.published, before),
-            car: car.clone(),
+            at: self.time_of(run, late.published, before),
+            car: run.0.clone(),
             payload: payload(late.topic, &late.bytes).ok()?,
         })
     }
@@ -262,6 +269,7 @@ mod tests {
         let arrives = |published: i64| published - 100 * SECOND + SECOND / 100;
         write(FleetEvent {
             payload: EventPayload::Clock {
+                run_id: None,
                 offset: 100 * SECOND,
                 round_trip: SECOND / 50,
             },

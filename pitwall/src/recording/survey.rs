@@ -10,7 +10,7 @@ use super::error::RecordingError;
 use super::note::Note;
 use super::reader::{RawEvent, read_raw};
 use super::summary::missing_content;
-use crate::event::SentRange;
+use crate::event::{RunEnd, SentRange};
 use crate::fleet::{Fleet, SequenceStatus, SequenceTracker};
 
 /// The streams of a recording.
@@ -20,13 +20,26 @@ pub(crate) struct Survey {
     /// When the first message of each car's run was published that is not an event, by the car's clock \[unix ns\]. Events
     /// may be older than the recording.
     pub(crate) begun: BTreeMap<(CarName, u64), i64>,
-    /// The run in which each car confirmed the end of its streams, and the newest run of each car.
-    confirmed: BTreeMap<CarName, u64>,
-    newest: BTreeMap<CarName, u64>,
+    /// The runs of each car, in the order in which they begin.
+    runs: BTreeMap<CarName, Vec<RunSurvey>>,
     /// Each car's clock minus the laptop's, by the last comparison \[ns\].
     offsets: BTreeMap<CarName, i64>,
+    /// The same of runs that have not sent anything yet.
+    early_offsets: BTreeMap<(CarName, u64), i64>,
     /// The first and the last log time \[unix ns\].
     pub(crate) span: Option<(i64, i64)>,
+}
+
+/// One run of a car.
+#[derive(Debug, Clone)]
+pub(crate) struct RunSurvey {
+    pub(crate) run_id: u64,
+    /// When its first and its last message were published, by the car's clock \[unix ns\].
+    pub(crate) published: [i64; 2],
+    /// The car's clock minus the laptop's in this run \[ns\]; None where they were not compared.
+    offset: Option<i64>,
+    /// How it is known that nothing follows; None where it is not.
+    pub(crate) end: Option<RunEnd>,
 }
 
 /// One stream.
@@ -128,7 +141,7 @@ pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
                 let least = delays.entry((car.clone(), header.run_id)).or_insert(delay);
                 *least = delay.min(*least);
                 stream.add(&header, delay - *least > LATE);
-                survey.newest.insert(car.clone(), header.run_id);
+                survey.add_to_run(&car, &header);
                 if topic != Topic::Event {
                     let begun = survey
                         .begun
@@ -150,15 +163,35 @@ pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
                 stream.rejected = stream.rejected.saturating_add(count);
             }
             RawEvent::Note(Note::StreamEnds {
-                run_id, outstanding, ..
+                run_id,
+                end,
+                outstanding,
+                ..
             }) => {
-                survey.confirmed.insert(car.clone(), run_id);
+                let runs = survey.runs.entry(car.clone()).or_default();
+                if let Some(run) = runs.iter_mut().rev().find(|run| run.run_id == run_id) {
+                    run.end = Some(end);
+                }
                 for SentRange { topic, from, to } in outstanding {
                     let stream = survey.streams.entry((car.clone(), topic)).or_default();
                     stream.numbers.sent(run_id, from, to);
                 }
             }
-            RawEvent::Note(Note::Clock { offset, .. }) => drop(survey.offsets.insert(car, offset)),
+            RawEvent::Note(Note::Clock { run_id, offset, .. }) => {
+                let runs = survey.runs.entry(car.clone()).or_default();
+                let run = match run_id {
+                    Some(run_id) => runs.iter_mut().rev().find(|run| run.run_id == run_id),
+                    None => runs.last_mut(),
+                };
+                match (run, run_id) {
+                    (Some(run), _) => run.offset = Some(offset),
+                    (None, Some(run_id)) if survey.early_offsets.len() < Survey::MOST_RUNS => {
+                        survey.early_offsets.insert((car.clone(), run_id), offset);
+                    }
+                    (None, _) => {}
+                }
+                survey.offsets.insert(car, offset);
+            }
             RawEvent::Note(_) => {}
         }
     }
@@ -213,11 +246,52 @@ impl Survey {
         cars
     }
 
-    /// True when the car has confirmed the end of its last run's streams.
-    pub(crate) fn confirmed(&self, car: &CarName) -> bool {
-        self.confirmed
-            .get(car)
-            .is_some_and(|run| self.newest.get(car) == Some(run))
+    /// Beyond this many, a run of a car is not told apart from the last one.
+    const MOST_RUNS: usize = 1000;
+
+    /// Notes a message of a run.
+    fn add_to_run(&mut self, car: &CarName, header: &Header) {
+        let Header {
+            run_id, published, ..
+        } = *header;
+        let runs = self.runs.entry(car.clone()).or_default();
+        let Some(run) = runs.iter_mut().rev().find(|run| run.run_id == run_id) else {
+            if runs.len() < Self::MOST_RUNS {
+                runs.push(RunSurvey {
+                    run_id,
+                    published: [published; 2],
+                    offset: self.early_offsets.remove(&(car.clone(), run_id)),
+                    end: None,
+                });
+            } else if let Some(last) = runs.last_mut() {
+                last.end = None;
+            }
+            return;
+        };
+        let [from, to] = run.published;
+        run.published = [from.min(published), to.max(published)];
+    }
+
+    /// The runs of a car, in the order in which they begin.
+    pub(crate) fn runs(&self, car: &CarName) -> &[RunSurvey] {
+        self.runs.get(car).map_or(&[], Vec::as_slice)
+    }
+
+    /// When the first message of a run was published that is not an event, by the car's clock \[unix ns\].
+    pub(crate) fn begin_of(&self, car: &CarName, run: &RunSurvey) -> i64 {
+        let begun = self.begun.get(&(car.clone(), run.run_id));
+        begun.copied().unwrap_or(run.published[0])
+    }
+
+    /// The car's clock minus the laptop's in a run, or else in another one \[ns\]; None where they were never compared.
+    pub(crate) fn compared(&self, car: &CarName, run_id: u64) -> Option<i64> {
+        let run = self.runs(car).iter().rev().find(|run| run.run_id == run_id);
+        run.and_then(|run| run.offset).or_else(|| self.offset(car))
+    }
+
+    /// The same; 0 where they were never compared.
+    pub(crate) fn offset_in(&self, car: &CarName, run_id: u64) -> i64 {
+        self.compared(car, run_id).unwrap_or_default()
     }
 
     /// The streams of a car.
@@ -252,9 +326,9 @@ impl Survey {
         streams.flat_map(|(topic, stream)| stream.gaps(topic)).collect()
     }
 
-    /// How many messages of the streams that must be complete are there, and from when to when they were published, by the
-    /// car's clock \[unix ns\].
-    pub(crate) fn received(&self, car: &CarName) -> Vec<(i64, i64, u64)> {
+    /// How many messages of the streams that must be complete are there of which run, and from when to when they were
+    /// published, by the car's clock \[unix ns\].
+    pub(crate) fn received(&self, car: &CarName) -> Vec<(u64, i64, i64, u64)> {
         let mut out = Vec::new();
         for (_, stream) in self
             .of(car)
@@ -274,7 +348,7 @@ impl Survey {
                 let gap = missing
                     .binary_search_by_key(&(*run, a + 1), |(run, [from, _])| (*run, *from))
                     .map_or(0, |at| missing[at].1[1] - missing[at].1[0] + 1);
-                out.push((**begin, **end, (b - a).saturating_sub(gap)));
+                out.push((*run, **begin, **end, (b - a).saturating_sub(gap)));
             }
         }
         out

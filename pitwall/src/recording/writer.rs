@@ -45,8 +45,8 @@ pub(super) struct RecordingWriter<W: Write + Seek> {
     ends: BTreeMap<CarName, End>,
     /// What the JSON channels of each car have.
     exported: BTreeMap<CarName, ExportedTimes>,
-    /// Each car's clock minus the laptop's \[ns\].
-    offsets: BTreeMap<CarName, i64>,
+    /// Each car's clock minus the laptop's \[ns\], and the run in which they were compared, if that is known.
+    offsets: BTreeMap<CarName, (Option<u64>, i64)>,
     notes: u32,
     messages: u64,
     first: Option<i64>,
@@ -125,6 +125,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 run_id,
                 published,
                 outstanding,
+                ..
             } => {
                 self.ends.insert(car.clone(), (*run_id, *published));
                 for SentRange { topic, from, to } in outstanding {
@@ -176,9 +177,12 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 };
                 if is_new {
                     // Other tools go by the log time: for them it is when a message would have arrived on a good link.
-                    let offset = self.offsets.get(car);
-                    let arrived =
-                        offset.map_or(*at, |offset| header.published.saturating_sub(*offset).min(*at));
+                    let known = self.offsets.get(car);
+                    let offset =
+                        known.filter(|(run_id, _)| run_id.is_none_or(|run_id| run_id == header.run_id));
+                    let arrived = offset.map_or(*at, |(_, offset)| {
+                        header.published.saturating_sub(*offset).min(*at)
+                    });
                     for exported in foxglove::export(car, header, telemetry) {
                         self.write_json(car, &exported, Times { arrived, ..times })?;
                     }
@@ -199,8 +203,12 @@ impl<W: Write + Seek> RecordingWriter<W> {
             }
             other => {
                 match other {
-                    EventPayload::Clock { offset, round_trip } => {
-                        self.offsets.insert(car.clone(), *offset);
+                    EventPayload::Clock {
+                        run_id,
+                        offset,
+                        round_trip,
+                    } => {
+                        self.offsets.insert(car.clone(), (*run_id, *offset));
                         self.session.on_clock(car, *offset, *round_trip);
                     }
                     EventPayload::Info(info) => self.session.on_info(car, info),

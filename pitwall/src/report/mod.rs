@@ -140,15 +140,16 @@ impl Coverage {
 
     /// The curve over the recording; empty where nothing can be missing.
     fn of(survey: &Survey, car: &CarName) -> Self {
-        let (Some((from, to)), Some(offset)) = (survey.span, survey.offset(car)) else {
+        let (Some((from, to)), Some(_)) = (survey.span, survey.offset(car)) else {
             return Self::default();
         };
         let length = ((to - from) as f64 * 1e-9).max(1e-3);
         let mut missing = vec![0.0; Self::CELLS];
         let mut sent = vec![0.0; Self::CELLS];
-        let spread = |cells: &mut Vec<f64>, begin: i64, end: i64, count: f64| {
+        let spread = |cells: &mut Vec<f64>, run_id: u64, begin: i64, end: i64, count: f64| {
+            let offset = survey.offset_in(car, run_id);
             let place = |at: i64| {
-                let share = (at - offset - from) as f64 * 1e-9 / length;
+                let share = at.saturating_sub(offset).saturating_sub(from) as f64 * 1e-9 / length;
                 ((share * Self::CELLS as f64).max(0.0) as usize).min(Self::CELLS - 1)
             };
             let (begin, end) = (place(begin), place(end.max(begin)));
@@ -160,11 +161,11 @@ impl Coverage {
             let (Some(begin), Some(end)) = (gap.from, gap.to) else {
                 continue;
             };
-            spread(&mut missing, begin, end, gap.count as f64);
-            spread(&mut sent, begin, end, gap.count as f64);
+            spread(&mut missing, gap.run_id, begin, end, gap.count as f64);
+            spread(&mut sent, gap.run_id, begin, end, gap.count as f64);
         }
-        for (begin, end, count) in survey.received(car) {
-            spread(&mut sent, begin, end, count as f64);
+        for (run_id, begin, end, count) in survey.received(car) {
+            spread(&mut sent, run_id, begin, end, count as f64);
         }
         let cell = |i: usize| (i as f64 + 0.5) / Self::CELLS as f64 * length;
         let shares = (0..Self::CELLS).filter(|i| sent[*i] > 0.0);

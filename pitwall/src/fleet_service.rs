@@ -16,7 +16,8 @@ use crate::event::{EventPayload, FleetEvent};
 use crate::event_bus::{EventBus, FleetGuard};
 use crate::fleet::Fleet;
 use crate::network::gap_recovery::Outstanding;
-use crate::network::{Client, Connection, ConnectionError, Role};
+use crate::network::recorders::Recorders;
+use crate::network::{Client, Connection, ConnectionError, RecorderNews, RecorderView, Role};
 use crate::recording::{
     Recorder, RecorderOptions, RecorderStatus, RecordingError, RecordingSummary, session_name,
 };
@@ -28,6 +29,9 @@ pub struct FleetService {
     warning: Option<String>,
     periodic_tasks: Mutex<Option<JoinHandle<()>>>,
     _acknowledged: Box<dyn Send + Sync>,
+    _heard_recorders: Box<dyn Send + Sync>,
+    /// The recorders of all pit walls on the network.
+    recorders: Arc<Mutex<Recorders>>,
     /// Cars whose map and info are being fetched. Over a slow link a fetch takes longer than the period of the fetches.
     fetching: Mutex<BTreeSet<CarName>>,
     /// Why the last recording has failed; None while it has not.
@@ -61,8 +65,24 @@ impl FleetService {
         let acknowledged = connection
             .watch_acknowledged(move |operator| fleet.fleet().acknowledge(unix_now(), operator))
             .await?;
+        let recorders = Arc::new(Mutex::new(Recorders::default()));
+        let (board, fleet) = (recorders.clone(), bus.clone());
+        let heard_recorders = connection
+            .watch_recorders(move |news| {
+                let host = news.host.clone();
+                let failure = lock(&board).hear(news, Instant::now());
+                if let Some(error) = failure {
+                    let text = format!("RECORDING FAILED on {host}: {error}");
+                    fleet
+                        .fleet()
+                        .add_entry(unix_now(), None, Severity::Critical, "recorder", text, None);
+                }
+            })
+            .await?;
         let service = Arc::new(Self {
             _acknowledged: acknowledged,
+            _heard_recorders: heard_recorders,
+            recorders,
             connection,
             bus,
             warning: exposure(role, protection),
@@ -245,8 +265,39 @@ impl FleetService {
         if let Err(error) = self.connection.subscribe_recorded(false).await {
             tracing::warn!(%error, "still subscribed to the full-rate topics");
         }
+        let news = self.recorder_news(true);
         let recorder = self.bus.detach_recorder()?;
+        if let Some(news) = news {
+            self.tell_recorder(news).await;
+        }
         tokio::task::spawn_blocking(move || recorder.finish()).await.ok()
+    }
+
+    /// What the recorder here does; None when nothing is being recorded.
+    fn recorder_news(&self, ended: bool) -> Option<RecorderNews> {
+        let (file, progress) = self.bus.recording()?;
+        let name = file.file_name().unwrap_or_default();
+        Some(RecorderNews {
+            host: sysinfo::System::host_name().unwrap_or_default(),
+            file: name.to_string_lossy().into_owned(),
+            seconds: progress.seconds,
+            bytes: progress.bytes,
+            missing: progress.missing.saturating_add(progress.overrun),
+            error: progress.error,
+            ended,
+            ..RecorderNews::default()
+        })
+    }
+
+    async fn tell_recorder(&self, news: RecorderNews) {
+        let news = self.connection.tell_recorder(news).await;
+        // Its failure is in the log of this pit wall already.
+        lock(&self.recorders).hear(news, Instant::now());
+    }
+
+    /// The recorders of all pit walls on the network; those that have failed or died come first.
+    pub fn recorders(&self) -> Vec<RecorderView> {
+        lock(&self.recorders).view(Instant::now())
     }
 
     async fn await_final_sync(&self) {
@@ -335,6 +386,9 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
             service.note_clock_step(&mut clock_step);
             service.note_moved_recording(&mut moved);
             service.end_failed_recording().await;
+            if let Some(news) = service.recorder_news(false) {
+                service.tell_recorder(news).await;
+            }
             let now = unix_now();
             let reports: Vec<_> = service
                 .fleet()
@@ -382,6 +436,10 @@ pub enum StartRecordingError {
     #[error(transparent)]
     Connection(#[from] ConnectionError),
 }
+fn lock<T>(shared: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// The warning of a pit wall that everybody on the network can read and command.
 fn exposure(role: &Role, protection: &Protection) -> Option<String> {
     let endpoint = role.reachable_endpoint()?;

@@ -71,8 +71,8 @@ pub use fleet::{
 };
 pub use fleet_service::{FleetService, StartRecordingError};
 pub use network::{
-    CarFiles, Client, Connection, ConnectionError, LOCAL_PITWALL, REPLY_TIMEOUT, Role, Router, Verdict,
-    new_command_id, open_router,
+    CarFiles, Client, Connection, ConnectionError, LOCAL_PITWALL, REPLY_TIMEOUT, RecorderNews, RecorderView,
+    Role, Router, Verdict, new_command_id, open_router,
 };
 pub use program::program;
 pub use recording::{

@@ -80,6 +80,7 @@ async fn lines(
                 for entry in &news {
                     output::print(&text::log_line(entry));
                 }
+                output::print(&text::recorders(&service.recorders()));
                 output::print(&match (car, views) {
                     (Some(_), [view, ..]) => text::card(view),
                     _ => text::table(views),

@@ -6,8 +6,8 @@ use zenoh::sample::Sample;
 
 use super::error::ConnectionError;
 
-/// The key that acknowledgements are put on. No car uses it.
-const KEY: &str = "pitwall/acknowledged";
+/// The key that acknowledgements are put on. No car has such a name. Keys allow a pit wall what is under `synpf`, and nothing else.
+const KEY: &str = "synpf/v1/_pitwall/acknowledged";
 
 /// An operator has acknowledged all alarms so far.
 #[derive(Serialize, Deserialize)]

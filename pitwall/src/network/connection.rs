@@ -23,6 +23,7 @@ use super::error::ConnectionError;
 use super::flood_limit::{Flood, FloodLimit};
 use super::gap_recovery::Outstanding;
 use super::marker;
+use super::recorders::{self, RecorderNews};
 use super::role::Role;
 use crate::clock::unix_now;
 use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
@@ -173,6 +174,19 @@ impl Connection {
         Ok(Box::new(
             acknowledgement::watch(&self.session, on_acknowledged).await?,
         ))
+    }
+
+    /// Tells the other pit walls what the recorder here does. Returns the same with the name of this program.
+    pub(crate) async fn tell_recorder(&self, news: RecorderNews) -> RecorderNews {
+        recorders::tell(&self.session, news).await
+    }
+
+    /// Calls `on_news` with what the recorders of other pit walls do, for as long as the result lives.
+    pub(crate) async fn watch_recorders(
+        &self,
+        on_news: impl Fn(RecorderNews) + Send + Sync + 'static,
+    ) -> Result<Box<dyn Send + Sync>, ConnectionError> {
+        recorders::watch(&self.session, on_news).await
     }
 
     /// Closes the zenoh session. Gives up after two seconds, because closing takes longer when the network is down.

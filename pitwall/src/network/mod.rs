@@ -9,6 +9,7 @@
 //! | `reorder_buffer.rs` | puts the messages of a stream in order and tracks which are missing; pure |
 //! | `gap_recovery.rs` | decides which missing messages to request, and when; pure |
 //! | `query.rs` | one query to a car |
+//! | `recorders.rs` | what the recorders of all pit walls do |
 //! | `client.rs` | queries and commands to a car |
 //! | `verdict.rs` | the outcome of a command |
 
@@ -21,6 +22,7 @@ mod flood_limit;
 pub(crate) mod gap_recovery;
 mod marker;
 mod query;
+pub(crate) mod recorders;
 mod reorder_buffer;
 mod role;
 mod run_gate;
@@ -29,6 +31,7 @@ mod verdict;
 pub use client::{CarFiles, Client, REPLY_TIMEOUT, new_command_id};
 pub use connection::{Connection, Router, open_router};
 pub use error::ConnectionError;
+pub use recorders::{RecorderNews, RecorderView};
 pub(crate) use role::endpoint;
 pub use role::{LOCAL_PITWALL, Role};
 pub use verdict::Verdict;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::Duration;
 
-use pitwall::{CarView, FleetService, HealthSample, LogEntry, unix_now};
+use pitwall::{CarView, FleetService, HealthSample, LogEntry, RecorderView, unix_now};
 use protocol::{Action, CarName, Severity};
 use ratatui::crossterm::event::{self, Event, KeyEventKind};
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -24,6 +24,8 @@ struct Shown {
     history: Vec<HealthSample>,
     log: Vec<LogEntry>,
     alarms: usize,
+    /// The recorders of the pit walls; None before the first update.
+    recorders: Option<Vec<RecorderView>>,
     selection: Selection,
     /// Outcome of the last command, and whether it succeeded; None while it runs.
     answer: Option<(Option<bool>, String)>,
@@ -143,6 +145,7 @@ impl Shown {
         let fleet = service.fleet();
         self.cars = fleet.view(unix_now());
         self.alarms = fleet.log().alarms();
+        self.recorders = Some(service.recorders());
         let from = fleet.log().last().saturating_sub(Self::LOG as u64);
         self.log = fleet.log().since(from).cloned().collect();
         // Late entries are sorted in by time.
@@ -238,17 +241,31 @@ impl Shown {
         let table = Table::new(rows, widths)
             .header(columns(head.map(Line::from)).dim())
             .row_highlight_style(Style::new().reversed())
-            .block(Block::bordered().title(" pit wall "));
+            .block(Block::bordered().title(self.title()));
         let mut state = TableState::new().with_selected(self.selection.car);
         if self.cars.is_empty() {
             let text = "no car yet; start one with car-node run ... --connect tcp/THIS-LAPTOP:7447";
             frame.render_widget(
-                Paragraph::new(text).block(Block::bordered().title(" pit wall ")),
+                Paragraph::new(text).block(Block::bordered().title(self.title())),
                 area,
             );
         } else {
             frame.render_stateful_widget(table, area, &mut state);
         }
+    }
+
+    /// The program, and what is recorded.
+    fn title(&self) -> Line<'static> {
+        let mut title = vec![Span::from(" pit wall ")];
+        if let Some(recorders) = &self.recorders {
+            let style = match &recorders[..] {
+                [] => Style::new().dim(),
+                all if all.iter().all(RecorderView::well) => Style::new().fg(Color::Green),
+                _ => Style::new().fg(Color::White).bg(Color::Red).bold(),
+            };
+            title.push(Span::styled(format!(" {} ", text::recorders(recorders)), style));
+        }
+        Line::from(title)
     }
 
     fn draw_car(&self, frame: &mut Frame<'_>, area: Rect) {

@@ -1,6 +1,6 @@
 //! Cars and log entries as text.
 
-use pitwall::{CarView, LogEntry};
+use pitwall::{CarView, LogEntry, RecorderView};
 use protocol::{Severity, Shadow};
 
 /// A table with one line per car.
@@ -31,6 +31,16 @@ pub(crate) fn table(cars: &[CarView]) -> String {
         text.push_str(&lines);
     }
     text
+}
+
+/// What the recorders of the pit walls do, on one line.
+pub(crate) fn recorders(recorders: &[RecorderView]) -> String {
+    let texts: Vec<_> = recorders.iter().map(ToString::to_string).collect();
+    if texts.is_empty() {
+        "nobody at the pit wall records".to_owned()
+    } else {
+        texts.join("; ")
+    }
 }
 
 /// One car in detail, on about a dozen lines.
@@ -115,6 +125,9 @@ pub(crate) fn card(car: &CarView) -> String {
             load.memory_process / 1_000_000,
             load.temperature.map_or_else(String::new, |t| format!("  {t:.0} C")),
         ));
+        if let Some(recorder) = &load.recorder {
+            lines.push(format!("on car  {recorder}"));
+        }
     }
     lines.join("\n")
 }

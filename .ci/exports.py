@@ -1,20 +1,29 @@
-"""A recording in everyone's tools: Python's `mcap`, `mcap-ros2-support` and `rosbags` read what `pitwall` writes.
+"""A recording in everyone's tools: Python's `mcap`, `mcap-ros2-support`, `rosbags` and `foxglove-sdk` read what `pitwall` writes.
 
     .ci/exports.py PITWALL CAR_NODE
 
 A simulated car drives for some seconds, and is recorded. The recording is checked, exported as ROS 2 bag and CSV, and read by
 libraries that know nothing of this project. At the end car-node localizes on its own bag.
+
+`foxglove-sdk` writes MCAP files. What it reads is for its data sets (`foxglove.datasets`, experimental): messages by topic and time,
+through the file's index. Its message types say which fields the schemas have.
 """
 
 import csv
 import json
 import math
+import re
 import subprocess
 import sys
 import tempfile
 import time
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
+import foxglove.messages
+from foxglove.datasets import ObjectLocation
+from foxglove.datasets.reader import EpisodeReader, _Episode
+from mcap.decoder import DecoderFactory as AnyDecoderFactory
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -60,6 +69,31 @@ def record(pitwall, car_node, folder):
     return file
 
 
+class Json(AnyDecoderFactory):
+    def decoder_for(self, message_encoding, _):
+        return json.loads if message_encoding == "json" else None
+
+
+class Disk:
+    def open(self, location):
+        return open(location.path, "rb")
+
+
+def read_by_foxglove(file, topics):
+    """Every message of the topics with its schema's name, and those of the middle second."""
+
+    def read(begin, end):
+        episode = _Episode("session", begin, end, {}, (ObjectLocation("", str(file)),))
+        reader = EpisodeReader(episode, tuple(topics), None, Disk())
+        return [(schema.name if schema else "", channel.topic, message.log_time, content)
+                for schema, channel, message, content in reader.iter_messages(decoder_factories=[Json()])]
+
+    every = read(datetime(2000, 1, 1, tzinfo=timezone.utc), datetime(2100, 1, 1, tzinfo=timezone.utc))
+    times = [at for _, _, at, _ in every]
+    middle = datetime.fromtimestamp(times[len(times) // 2] // 1_000_000_000, timezone.utc)
+    return every, read(middle, middle + timedelta(seconds=1)), int(middle.timestamp()) * 1_000_000_000
+
+
 def main(pitwall, car_node):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -80,6 +114,20 @@ def main(pitwall, car_node):
         check(topics["/blue/pose"] >= received["recorded_pose"], f"mcap: {topics['/blue/pose']} poses in Foxglove's schema")
         check({"club.pgm", "club.yaml"} <= names, f"mcap: attachments {sorted(names)}")
         check({"pitwall.session", "pitwall.cars", "pitwall.set"} <= metadata, f"mcap: metadata {sorted(metadata)}")
+
+        every, second, begin = read_by_foxglove(file, topics)
+        counts = {}
+        for schema, topic, _, content in every:
+            counts[topic] = counts.get(topic, 0) + 1
+            kind, _, name = schema.partition(".")
+            if kind == "foxglove":
+                signature = getattr(foxglove.messages, name).__text_signature__
+                fields = set(re.findall(r"(\w+)=", signature))
+                if not set(content) <= fields:
+                    check(False, f"foxglove-sdk: {topic}: {schema} has no {set(content) - fields}")
+        check(counts == topics, f"foxglove-sdk: {len(every)} messages in the JSON channels, with fields of its schemas")
+        within = sum(begin <= at < begin + 1_000_000_000 for _, _, at, _ in every)
+        check(abs(len(second) - within) <= 2 and within > 50, f"foxglove-sdk: {len(second)} messages of one second, by the index")
 
         run(pitwall, "export", file)
         with open(folder / "session.csv" / "poses.csv") as stream:

@@ -13,8 +13,8 @@ use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
     Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Key, Latency, Load,
     MapRaceline, MapReply, Message, Metrics, MissingRequest, Outcome, ParameterSet, Params, ParamsAction,
-    Pose, Pose2, PoseKind, RecordedOdometry, RelocalizeAction, Reply, ScanView, SetRef, Stamps, State, Topic,
-    TrackPoint, Twist2, Value, decode, encode,
+    Pose, Pose2, PoseKind, RecordedOdometry, RecordedScan, RelocalizeAction, Reply, ScanView, SetRef, Stamps,
+    State, Topic, TrackPoint, Truth, Twist2, Value, decode, encode,
 };
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
@@ -38,6 +38,8 @@ pub struct Behaviour {
     pub run_id: Option<u64>,
     /// It is of a version without liveliness tokens of runs.
     pub without_run_token: bool,
+    /// It sends scans and all that a real car does at full rate, too.
+    pub full_rate: bool,
     /// Its distance behind the other cars on the lap, in updates of 25 ms.
     pub updates_behind: u64,
 }
@@ -256,6 +258,17 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
             twist: pose.twist,
         };
         topics.put(Topic::RecordedOdometry, &odometry, &state).await;
+        if behaviour.full_rate {
+            let truth = Truth {
+                pose: pose.pose,
+                twist: pose.twist,
+            };
+            topics.put(Topic::RecordedTruth, &truth, &state).await;
+            topics
+                .put(Topic::RecordedScan, &recorded_scan(update), &state)
+                .await;
+            topics.put(Topic::RecordedHealth, &health(update), &state).await;
+        }
         if update % 4 == 1 {
             topics.put(Topic::Health, &health(update), &state).await;
             topics.put(Topic::Cloud, &cloud(&pose, update), &state).await;
@@ -374,6 +387,27 @@ fn scan_view(pose: &Pose) -> ScanView {
         update: pose.update,
         centre,
         points: (0..100).map(point).collect(),
+    }
+}
+
+/// A scan of a usual laser between the walls, with a few millimetres of noise.
+fn recorded_scan(update: u64) -> RecordedScan {
+    const BEAMS: u64 = 1081;
+    let mut bits = update.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let range = |beam: u64| {
+        bits ^= bits << 13;
+        bits ^= bits >> 7;
+        bits ^= bits << 17;
+        let wave = (beam as f64 / 90.0).sin().abs() * 3000.0;
+        1000 + wave as u16 + (bits % 16) as u16
+    };
+    RecordedScan {
+        angle_min: -2.356,
+        angle_increment: 0.004_36,
+        time_increment: 0.0,
+        range_min: 0.06,
+        range_max: 30.0,
+        ranges: (0..BEAMS).map(range).collect(),
     }
 }
 

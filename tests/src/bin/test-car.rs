@@ -3,7 +3,7 @@
 //! ```text
 //! test-car race NAME START ENDPOINT [STATE [RECORDINGS]]   a real node in a simulated car on the bundled track; STATE is the folder
 //!                                             that its sets are kept in, RECORDINGS that of the recordings on the car
-//! test-car rings COUNT ENDPOINT               fake cars, car-1 to car-COUNT, at full rate
+//! test-car rings COUNT ENDPOINT [full]        fake cars, car-01 to car-COUNT; `full` with scans and all else at full rate
 //! ```
 
 use std::path::Path;
@@ -14,7 +14,7 @@ use protocol::CarName;
 use system_tests::{Behaviour, FakeCar, start_recording};
 
 /// The process ends after this time, in case the test was killed.
-const LONGEST: Duration = Duration::from_mins(10);
+const LONGEST: Duration = Duration::from_mins(15);
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -28,8 +28,11 @@ fn main() -> anyhow::Result<()> {
             Some(Path::new(state)),
             record.first().map(Path::new),
         ),
-        ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint),
-        _ => bail!("usage: test-car race NAME START ENDPOINT [STATE [RECORDINGS]] | rings COUNT ENDPOINT"),
+        ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint, false),
+        ["rings", count, endpoint, "full"] => rings(count.parse().context("COUNT")?, endpoint, true),
+        _ => bail!(
+            "usage: test-car race NAME START ENDPOINT [STATE [RECORDINGS]] | rings COUNT ENDPOINT [full]"
+        ),
     }
 }
 
@@ -47,12 +50,13 @@ fn race(
     Ok(())
 }
 
-fn rings(count: u64, endpoint: &str) -> anyhow::Result<()> {
+fn rings(count: u64, endpoint: &str, full_rate: bool) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let mut cars = Vec::new();
         for number in 1..=count {
             let behaviour = Behaviour {
+                full_rate,
                 updates_behind: number * 80 / count.max(1),
                 ..Behaviour::default()
             };

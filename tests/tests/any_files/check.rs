@@ -4,12 +4,18 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
+use car_node::evaluate::read_poses;
 use car_node::sensors::bag::{Bag, Topics};
 use maps::{OccupancyGrid, Raceline};
-use pitwall::{EventPayload, Fleet, FleetEvent, Recorder, Replay, Report, read_events, read_in_order};
+use pitwall::{
+    EventPayload, Fleet, FleetEvent, Recorder, Replay, Report, SessionIndex, read_events, read_in_order,
+};
 use protocol::{
     Covariance, Event, EventKind, Header, Pose, Pose2, PoseKind, Stamps, Telemetry, Topic, Twist2, encode,
+    ros,
 };
+use rusqlite::{Connection, params};
+use simulator::TrackSpec;
 use system_tests::{room, write_bag};
 
 /// A file that is read completely is counted as read, any other one as refused.
@@ -28,13 +34,24 @@ impl Tally {
 /// A sound file of each kind, and a place for damaged ones.
 pub(crate) struct Files {
     folder: tempfile::TempDir,
-    recording: Vec<u8>,
-    bag: Vec<u8>,
+    samples: [Vec<u8>; Self::KINDS],
 }
 
 const YAML: &str = "image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n\
                     occupied_thresh: 0.65\nfree_thresh: 0.196\n";
 const RACELINE: &str = "# x_m, y_m, vx_mps\n0.0, 0.0, 1.0\n1.0, 0.0, 2.0\n1.0, 1.0, 3.0\n0.0, 1.0, 2.0\n";
+const RACELINE_JSON: &str = r#"{"global_traj_wpnts_iqp": {"wpnts": [{"x_m": 0.0, "y_m": 0.0, "vx_mps": 1.0}, {"x_m": 1.0, "y_m": 0.0, "vx_mps": 1.0},
+    {"x_m": 1.0, "y_m": 1.0, "vx_mps": 2.0}, {"x_m": 0.0, "y_m": 1.0, "vx_mps": 2.0}]}}"#;
+const METADATA: &str = "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  message_count: 1\n  \
+                        topics_with_message_count:\n    - topic_metadata:\n        name: /scan\n        type: \
+                        sensor_msgs/msg/LaserScan\n        serialization_format: cdr\n      message_count: 1\n  \
+                        relative_file_paths:\n    - bag_0.mcap\n";
+const PARAMETERS: &str = "particle_filter:\n  ros__parameters:\n    max_particles: 4000\n    sigma_hit: 0.1\n    z_hit: 0.8\n    \
+                          range_method: rmgpu\n    max_range: 30.0\n    squash_factor: 2.2\n";
+const TRACK: &str = "name: club\nseed: 3\nlength: 60.0\n";
+const POSES: &str = "# stamp_s, x_m, y_m, heading_rad\n1.0, 0.0, 0.0, 0.0\n1.1, 0.1, 0.0, 0.01\n";
+const KEYS: &str = r#"{"format": 1, "role": "car", "name": "blue", "authority": "-----BEGIN CERTIFICATE-----\nMIIB\n-----END CERTIFICATE-----\n",
+    "certificate": "-----BEGIN CERTIFICATE-----\nMIIB\n-----END CERTIFICATE-----\n", "key": "-----BEGIN PRIVATE KEY-----\nMIIB\n-----END PRIVATE KEY-----\n", "members": []}"#;
 /// Walls around a free place.
 const PGM: &str = "P2 5 4 255\n0 0 0 0 0\n0 254 254 254 0\n0 254 205 254 0\n0 0 0 0 0\n";
 /// A grey PNG of one pixel.
@@ -46,30 +63,37 @@ const PNG: [u8; 67] = [
 ];
 
 impl Files {
-    /// Recording, bag, YAML, PGM, PNG, raceline.
-    pub(crate) const KINDS: usize = 6;
+    /// Recording; bags of ROS 2 in MCAP and SQLite, and of ROS 1; map as YAML, PGM, PNG; raceline as CSV and JSON; a bag's
+    /// metadata, parameters, track, poses, keys, index of sessions.
+    pub(crate) const KINDS: usize = 15;
 
     pub(crate) fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
-        let bag = folder.path().join("bag.mcap");
-        write_bag(&bag, &room(), 0.5);
-        Self {
-            recording: recording(&folder.path().join("session.mcap")),
-            bag: std::fs::read(&bag).expect("written"),
-            folder,
-        }
+        let path = |name: &str| folder.path().join(name);
+        write_bag(&path("bag.mcap"), &room(), 0.5);
+        let samples = [
+            recording(&path("session.mcap")),
+            std::fs::read(path("bag.mcap")).expect("written"),
+            sqlite_bag(&path("bag.db3")),
+            ros1_bag(),
+            YAML.into(),
+            PGM.into(),
+            PNG.to_vec(),
+            RACELINE.into(),
+            RACELINE_JSON.into(),
+            METADATA.into(),
+            PARAMETERS.into(),
+            TRACK.into(),
+            POSES.into(),
+            KEYS.into(),
+            index_of_sessions(folder.path()),
+        ];
+        Self { folder, samples }
     }
 
     /// A sound file of a kind.
     pub(crate) fn sample(&self, kind: usize) -> Vec<u8> {
-        match kind {
-            0 => self.recording.clone(),
-            1 => self.bag.clone(),
-            2 => YAML.into(),
-            3 => PGM.into(),
-            4 => PNG.to_vec(),
-            _ => RACELINE.into(),
-        }
+        self.samples[kind].clone()
     }
 
     /// Reads a file of a kind in every way that there is.
@@ -77,15 +101,53 @@ impl Files {
         let text = || String::from_utf8_lossy(bytes);
         match kind {
             0 => self.read_recording(bytes, tally),
-            1 => {
-                let file = self.write("damaged-bag.mcap", bytes);
-                let sensors = Bag::read(&file).and_then(|bag| bag.sensors(&Topics::default(), None));
-                tally.add(sensors.is_ok());
+            1 => tally.add(self.reads_bag("damaged-bag.mcap", bytes)),
+            2 => tally.add(self.reads_bag("damaged-bag.db3", bytes)),
+            3 => tally.add(self.reads_bag("damaged.bag", bytes)),
+            4 => tally.add(OccupancyGrid::from_parts(&text(), PGM.as_bytes()).is_ok()),
+            5 | 6 => tally.add(OccupancyGrid::from_parts(YAML, bytes).is_ok()),
+            7 => tally.add(Raceline::parse("raceline.csv", &text()).is_ok()),
+            8 => tally.add(Raceline::parse("raceline.json", &text()).is_ok()),
+            9 => tally.add(self.reads_bag_folder(bytes)),
+            10 => {
+                tally.add(synpf::parameter_table(&text()).is_ok());
+                tally.add(car_node::import::import(&text(), 0.05).is_ok());
             }
-            2 => tally.add(OccupancyGrid::from_parts(&text(), PGM.as_bytes()).is_ok()),
-            3 | 4 => tally.add(OccupancyGrid::from_parts(YAML, bytes).is_ok()),
-            _ => tally.add(Raceline::parse("raceline.csv", &text()).is_ok()),
+            11 => tally.add(TrackSpec::parse("track.yaml", &text()).is_ok()),
+            12 => {
+                let file = self.write("damaged.csv", bytes);
+                tally.add(read_poses(&file, maps::Pose::IDENTITY).is_ok());
+            }
+            13 => tally.add(keys::Bundle::read(&self.write("damaged.keys", bytes)).is_ok()),
+            _ => self.read_index(bytes, tally),
         }
+    }
+
+    fn reads_bag(&self, name: &str, bytes: &[u8]) -> bool {
+        let file = self.write(name, bytes);
+        let sensors = Bag::read(&file).and_then(|bag| bag.sensors(&Topics::default(), None));
+        sensors.is_ok()
+    }
+
+    /// A bag as rosbag2 leaves it, with this metadata.
+    fn reads_bag_folder(&self, metadata: &[u8]) -> bool {
+        let folder = self.folder.path().join("folder");
+        std::fs::create_dir_all(&folder).expect("made");
+        std::fs::write(folder.join("bag_0.mcap"), &self.samples[1]).expect("written");
+        std::fs::write(folder.join("metadata.yaml"), metadata).expect("written");
+        Bag::read(&folder).is_ok()
+    }
+
+    /// The index of a folder without recordings.
+    fn read_index(&self, bytes: &[u8], tally: &mut Tally) {
+        let folder = self.folder.path().join("sessions");
+        std::fs::create_dir_all(&folder).expect("made");
+        std::fs::write(folder.join(INDEX), bytes).expect("written");
+        let found = SessionIndex::open(&folder).and_then(|mut index| {
+            index.refresh(None, |_| {})?;
+            index.search("club")
+        });
+        tally.add(found.is_ok());
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> PathBuf {
@@ -109,7 +171,126 @@ impl Files {
     }
 }
 
-/// What report, check, export and replay read of a recording.
+/// Name of the index of sessions.
+const INDEX: &str = ".sessions.sqlite";
+
+fn index_of_sessions(folder: &Path) -> Vec<u8> {
+    let sessions = folder.join("indexed");
+    std::fs::create_dir(&sessions).expect("made");
+    std::fs::copy(folder.join("session.mcap"), sessions.join("session.mcap")).expect("copied");
+    let mut index = SessionIndex::open(&sessions).expect("made");
+    index.refresh(None, |_| {}).expect("indexed");
+    drop(index);
+    std::fs::read(sessions.join(INDEX)).expect("written")
+}
+
+/// A scan and an odometry message of a bag.
+fn scan_and_odometry(at: i64) -> [Vec<u8>; 2] {
+    let scan = ros::laser_scan(&ros::LaserScan {
+        stamp: at,
+        angle_min: -1.0,
+        angle_max: 1.0,
+        angle_increment: 0.1,
+        time_increment: 0.0,
+        scan_time: 0.025,
+        range_min: 0.05,
+        range_max: 30.0,
+        ranges: &[2.0; 21],
+    });
+    [
+        scan,
+        ros::odometry(at, ros::ODOM, Pose2::default(), Twist2::default()),
+    ]
+}
+
+fn sqlite_bag(path: &Path) -> Vec<u8> {
+    let bag = Connection::open(path).expect("made");
+    bag.execute_batch(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+             serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);
+         CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+             data BLOB NOT NULL);
+         INSERT INTO topics VALUES(1, '/scan', 'sensor_msgs/msg/LaserScan', 'cdr', '');
+         INSERT INTO topics VALUES(2, '/odom', 'nav_msgs/msg/Odometry', 'cdr', '');",
+    )
+    .expect("written");
+    for number in 1..=20_i64 {
+        let at = 1_700_000_000_000_000_000 + number * 25_000_000;
+        for (topic, data) in (1..).zip(scan_and_odometry(at)) {
+            bag.execute(
+                "INSERT INTO messages(topic_id, timestamp, data) VALUES(?1, ?2, ?3)",
+                params![topic, at, data],
+            )
+            .expect("written");
+        }
+    }
+    drop(bag);
+    std::fs::read(path).expect("written")
+}
+
+/// A bag of ROS 1 with one chunk: a connection for odometry, and a message.
+fn ros1_bag() -> Vec<u8> {
+    let text = |name: &str, value: &[u8]| [name.as_bytes(), b"=", value].concat();
+    let record = |fields: &[Vec<u8>], data: &[u8]| {
+        let header: Vec<u8> = fields
+            .iter()
+            .flat_map(|field| [&(field.len() as u32).to_le_bytes()[..], field].concat())
+            .collect();
+        let (header_len, data_len) = (header.len() as u32, data.len() as u32);
+        [
+            &header_len.to_le_bytes()[..],
+            &header,
+            &data_len.to_le_bytes(),
+            data,
+        ]
+        .concat()
+    };
+    let fields = |fields: &[Vec<u8>]| {
+        let field = |field: &Vec<u8>| [&(field.len() as u32).to_le_bytes()[..], field].concat();
+        fields.iter().flat_map(field).collect::<Vec<u8>>()
+    };
+    let head = [
+        text("op", &[3]),
+        text("index_pos", &0_u64.to_le_bytes()),
+        text("conn_count", &1_u32.to_le_bytes()),
+        text("chunk_count", &1_u32.to_le_bytes()),
+    ];
+    let connection = record(
+        &[text("op", &[7]), text("conn", &[0; 4]), text("topic", b"/odom")],
+        &fields(&[
+            text("topic", b"/odom"),
+            text("type", b"nav_msgs/Odometry"),
+            text("md5sum", b"cd5e73d190d741a2f92e81eda573aca7"),
+            text("message_definition", b""),
+        ]),
+    );
+    let mut odometry = [1_u32, 5, 6].map(u32::to_le_bytes).concat();
+    for name in [&b"odom"[..], b"base_link"] {
+        odometry.extend((name.len() as u32).to_le_bytes());
+        odometry.extend(name);
+    }
+    odometry.extend([0; 8 * (7 + 36 + 6 + 36)]);
+    let message = record(
+        &[
+            text("op", &[2]),
+            text("conn", &[0; 4]),
+            text("time", &5_u64.to_le_bytes()),
+        ],
+        &odometry,
+    );
+    let content = [connection, message].concat();
+    let chunk = record(
+        &[
+            text("op", &[5]),
+            text("compression", b"none"),
+            text("size", &(content.len() as u32).to_le_bytes()),
+        ],
+        &content,
+    );
+    [b"#ROSBAG V2.0\n".to_vec(), record(&head, &[b' '; 64]), chunk].concat()
+}
+
+/// What report, check, export, merge and replay read of a recording.
 fn read_all(file: &Path, tally: &mut Tally) {
     tally.add(read_events(file).is_ok_and(|mut events| events.all(|event| event.is_ok())));
     tally.add(pitwall::check(file).is_ok());
@@ -118,6 +299,10 @@ fn read_all(file: &Path, tally: &mut Tally) {
         let mut fleet = Fleet::default();
         events.prepare(&mut fleet);
         events.map_while(Result::ok).for_each(|event| fleet.apply(&event));
+    }
+    let merged = file.with_extension("merged");
+    if pitwall::merge(&[file.to_owned()], &merged).is_ok() {
+        std::fs::remove_file(&merged).expect("removed");
     }
     if let Ok(replay) = Replay::start(file) {
         replay.stop();

@@ -2,6 +2,8 @@
 
 mod check;
 
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
 use check::{Files, Tally};
 
 /// Numbers from a seed.
@@ -41,6 +43,33 @@ fn a_flipped_or_a_missing_byte_is_an_error_and_never_a_crash() {
         files.read(kind, &whole, &mut tally);
     }
     assert!(tally.read > 0 && tally.refused > 0, "{tally:?}");
+}
+
+/// Damages files of every kind for `PITWALL_FUZZ_SECONDS`, each time others.
+#[test]
+#[expect(clippy::print_stderr, reason = "the seed is the result of the run")]
+fn files_are_damaged_for_a_while() {
+    let seconds = std::env::var("PITWALL_FUZZ_SECONDS").ok();
+    let Some(seconds) = seconds.and_then(|text| text.parse().ok()) else {
+        return;
+    };
+    let until = Instant::now() + Duration::from_secs(seconds);
+    let seed = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .map_or(0, |now| now.as_nanos() as u64);
+    let (mut roll, mut count) = (dice(seed), [0_u64; Files::KINDS]);
+    while Instant::now() < until {
+        // Recordings are large and slow to read: the others come more often.
+        let kind = if roll(20) == 0 { 0 } else { roll(Files::KINDS) };
+        let mut bytes = vec![kind as u8, 1 + 2 * roll(2) as u8];
+        for _ in 0..=roll(4) {
+            bytes.extend([roll(256), roll(256), roll(2), roll(256)].map(|byte| byte as u8));
+        }
+        let outcome = std::panic::catch_unwind(|| check::check(&bytes));
+        assert!(outcome.is_ok(), "seed {seed}: {bytes:?}");
+        count[kind] += 1;
+    }
+    eprintln!("seed {seed}: damaged files of each kind: {count:?}");
 }
 
 /// The same bytes that the fuzzer would make, with a fixed seed.

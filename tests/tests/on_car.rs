@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use pitwall::{EventPayload, FetchOptions, FleetService, read_events};
+use pitwall::{EventPayload, FetchOptions, FleetService, RunEnd, read_events};
 use protocol::{Action, CarName, Outcome, RecordAction, Reply, Topic};
 use system_tests::{Link, named, recording, send_command, wait_until};
 
@@ -164,8 +164,12 @@ async fn a_cut_link_and_a_reboot_leave_no_hole_after_fetch_and_merge() {
     let filled = after[&first_run].len() - before[&first_run].len();
     assert!(filled > 10, "{filled} scans were only on the car");
     assert_eq!(report.summary.missing(), 0, "{}", report.summary);
+    // Before, nobody knows how far the run goes that was cut off. Afterwards it has lost what was not on its disk, and no more.
+    let before = pitwall::check(&laptop).expect("a recording");
+    assert!(!before.all_there_is, "{before}");
     let check = pitwall::check(&merged).expect("a recording");
-    assert!(check.complete && check.cars[0].confirmed, "{check}");
+    assert!(check.all_there_is && !check.complete, "{check}");
+    assert_eq!(check.cars[0].runs[0].end, Some(RunEnd::CutOff), "{check}");
     for topic in [
         Topic::RecordedPose,
         Topic::RecordedOdometry,

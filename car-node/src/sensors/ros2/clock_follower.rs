@@ -2,8 +2,9 @@
 //!
 //! A sensor's clock may be set: by NTP, or because a simulator starts again. Its stamps then jump, and the filter must not see
 //! that. Each stream has a shift that is added to its stamps. A stamp that goes back, or that comes earlier than the way here
-//! allows, changes the shift, so that time goes on as it did before. Streams that jump by the same are on one clock and get the
-//! same shift, which keeps the time between a scan and odometry exact.
+//! allows, changes the shift, so that time goes on as it did before. Another stream takes the same step as soon as its messages come
+//! rather as late as they used to with it than without it. That keeps the time between a scan and odometry exact, however late a
+//! busy machine was when it saw the step.
 //!
 //! How late messages come says what the clock shows now. It is followed, too: it may drift, stand still while a simulator is
 //! paused, or run at another speed.
@@ -16,14 +17,15 @@ use super::topics::Kind;
 
 /// Steps by less are late messages [ns]: 0.1 s.
 const LEAST_STEP: i64 = 100_000_000;
-/// Two streams step by the same if they differ by less [ns]: 50 ms.
-const SAME_STEP: i64 = 50_000_000;
-/// ... and so soon after each other [ns]: 3 s.
+/// Streams of one clock step so soon after each other [ns]: 3 s.
 const TOGETHER: i64 = 3_000_000_000;
-/// A stream that steps more often within [`FLAPPING`] has two publishers.
+/// A stream that steps more often within [`FLAPPING`] may have two publishers: its steps are not followed at once.
 const MOST_STEPS: usize = 4;
 /// [ns]: 10 s.
 const FLAPPING: i64 = 10_000_000_000;
+/// After so long without another step it has one publisher, whose clock was set often. Time that has not gone on for so long is made to
+/// [ns]: 1 s.
+const STEADY: i64 = 1_000_000_000;
 /// Messages by which a stream's usual delay and spacing are known.
 const KNOWN: usize = 32;
 /// Fewer say nothing.
@@ -58,6 +60,14 @@ struct Stream {
     steps: VecDeque<i64>,
     /// It steps too often, and that was said.
     flapping: bool,
+    /// When it made the last step that was not followed, and its usual delay before the first of them \[ns\].
+    waiting: Option<[i64; 2]>,
+    /// The newest stamp that was passed on, and when it came \[ns\].
+    newest: Option<[i64; 2]>,
+    /// When the first message came since then that was not newer \[ns\].
+    stuck: Option<i64>,
+    /// The last step that it took, by its time \[ns\].
+    taken: Option<i64>,
 }
 
 /// A message's stamp, and what it says of the clocks.
@@ -141,32 +151,37 @@ impl ClockFollower {
     /// Takes in a stamp as it came, of a scan, odometry or an IMU.
     pub(super) fn follow(&mut self, kind: Kind, stamp: Stamp, arrival: Stamp) -> FollowedStamp {
         let last_step = self.last_step;
+        let known = self.known_delay();
         let stream = match kind {
             Kind::Scan => &mut self.scan,
             Kind::Imu => &mut self.imu,
             _ => &mut self.odometry,
         };
+        if let (None, Some((shift, delay))) = (stream.last, known) {
+            stream.begin(stamp.0, arrival.0, shift, delay);
+        }
         let mut flapping = false;
-        let step = stream.step(stamp.0, arrival.0);
         let mut said = None;
-        if let Some(by) = step {
-            while stream.steps.front().is_some_and(|at| arrival.0 - at > FLAPPING) {
-                stream.steps.pop_front();
-            }
-            stream.flapping &= !stream.steps.is_empty();
-            keep(&mut stream.steps, arrival.0, MOST_STEPS + 1);
-            if stream.steps.len() > MOST_STEPS {
-                flapping = !std::mem::replace(&mut stream.flapping, true);
-            } else {
-                let [at, before] = last_step.unwrap_or([i64::MIN; 2]);
-                let together =
-                    arrival.0.saturating_sub(at) < TOGETHER && by.abs_diff(before) < SAME_STEP as u64;
-                let by = if together { before } else { by };
-                stream.shift = stream.shift.saturating_sub(by);
-                if !together {
-                    self.last_step = Some([arrival.0, by]);
-                    said = Some(by as f64 * 1e-9);
+        if let Some([at, by]) = last_step
+            && stream.taken != Some(at)
+            && arrival.0.saturating_sub(at) < TOGETHER
+            && stream.fits_with(by, stamp.0, arrival.0)
+        {
+            stream.take(by, at);
+        } else {
+            let step = match stream.step(stamp.0, arrival.0) {
+                Some(_) if stream.steps_too_often(arrival.0) => {
+                    flapping = !std::mem::replace(&mut stream.flapping, true);
+                    stream.wait(arrival.0);
+                    None
                 }
+                Some(by) => Some(by),
+                None => stream.overdue_step(stamp.0, arrival.0),
+            };
+            if let Some(by) = step.or_else(|| stream.standstill(stamp.0, arrival.0)) {
+                stream.take(by, arrival.0);
+                self.last_step = Some([arrival.0, by]);
+                said = Some(by as f64 * 1e-9);
             }
         }
         let followed = Stamp(stamp.0.saturating_add(stream.shift));
@@ -177,6 +192,13 @@ impl ClockFollower {
             flapping,
             clock: self.clock_setting(followed, arrival),
         }
+    }
+
+    /// The shift and the usual delay of a stream that runs \[ns\].
+    fn known_delay(&self) -> Option<(i64, i64)> {
+        [&self.odometry, &self.scan]
+            .into_iter()
+            .find_map(|stream| Some((stream.shift, median(&stream.delays)?)))
     }
 
     /// Whether the clock must be set, by a message with this stamp that came in now.
@@ -263,6 +285,87 @@ impl Stream {
             .then(|| median(&self.delays).unwrap_or(0).saturating_sub(delay))
     }
 
+    /// Notes a step. True if there were too many lately.
+    fn steps_too_often(&mut self, arrival: i64) -> bool {
+        while self.steps.front().is_some_and(|at| arrival - at > FLAPPING) {
+            self.steps.pop_front();
+        }
+        self.flapping &= !self.steps.is_empty();
+        keep(&mut self.steps, arrival, MOST_STEPS + 1);
+        self.steps.len() > MOST_STEPS
+    }
+
+    /// A step is not followed yet.
+    fn wait(&mut self, arrival: i64) {
+        let usual = match self.waiting {
+            Some([_, usual]) => usual,
+            None => median(&self.delays).unwrap_or(0),
+        };
+        self.waiting = Some([arrival, usual]);
+    }
+
+    /// The step that was not followed, once the stream is steady \[ns\].
+    fn overdue_step(&mut self, stamp: i64, arrival: i64) -> Option<i64> {
+        let [_, usual] = self
+            .waiting
+            .take_if(|[at, _]| arrival.saturating_sub(*at) > STEADY)?;
+        let by = usual.saturating_sub(self.delay(stamp, arrival));
+        // A step forward has been passed on, and time must not go back.
+        let goes_on = self
+            .newest
+            .is_none_or(|[newest, _]| stamp.saturating_add(self.shift).saturating_sub(by) > newest);
+        if !goes_on {
+            self.delays.clear();
+            self.least_delay = None;
+        }
+        (goes_on && by.saturating_abs() > LEAST_STEP).then_some(by)
+    }
+
+    /// The step that lets time go on, where it has not for long \[ns\]: whatever the reason, the filter would refuse all that comes.
+    fn standstill(&self, stamp: i64, arrival: i64) -> Option<i64> {
+        let ([newest, at], stuck) = (self.newest?, self.stuck?);
+        let followed = stamp.saturating_add(self.shift);
+        let waited = arrival.saturating_sub(at);
+        (arrival.saturating_sub(stuck) > STEADY && followed <= newest)
+            .then(|| followed.saturating_sub(newest).saturating_sub(waited))
+    }
+
+    /// From a stamp to its arrival \[ns\].
+    fn delay(&self, stamp: i64, arrival: i64) -> i64 {
+        arrival.saturating_sub(stamp.saturating_add(self.shift))
+    }
+
+    /// True if a message comes rather as late as usual with a step than without it.
+    fn fits_with(&self, by: i64, stamp: i64, arrival: i64) -> bool {
+        median(&self.delays).is_some_and(|usual| {
+            let off = self.delay(stamp, arrival).saturating_sub(usual);
+            off.saturating_add(by).saturating_abs() < off.saturating_abs()
+        })
+    }
+
+    /// Takes a step, which happened at this arrival.
+    fn take(&mut self, by: i64, at: i64) {
+        self.shift = self.shift.saturating_sub(by);
+        self.taken = Some(at);
+        // They may be off by how late the message was that showed the step.
+        self.delays.clear();
+        self.gaps.clear();
+        self.least_delay = None;
+    }
+
+    /// The first message of a stream that begins later than others: it has their shift if that fits, and none else.
+    fn begin(&mut self, stamp: i64, arrival: i64, shift: i64, delay: i64) {
+        let off = |shift: i64| {
+            arrival
+                .saturating_sub(stamp.saturating_add(shift))
+                .saturating_sub(delay)
+                .saturating_abs()
+        };
+        if off(shift) < off(0) {
+            self.shift = shift;
+        }
+    }
+
     /// Notes a message, as it came and as it is passed on.
     fn note(&mut self, stamp: i64, followed: i64, arrival: i64) {
         let delay = arrival.saturating_sub(followed);
@@ -273,6 +376,12 @@ impl Stream {
             keep(&mut self.gaps, stamp - last, KNOWN);
         }
         self.least_delay = Some(self.least_delay.map_or(delay, |least| least.min(delay)));
+        if self.newest.is_none_or(|[newest, _]| followed > newest) {
+            self.newest = Some([followed, arrival]);
+            self.stuck = None;
+        } else {
+            self.stuck.get_or_insert(arrival);
+        }
         self.last = Some([stamp, arrival]);
     }
 }
@@ -448,6 +557,72 @@ mod tests {
             flapping += usize::from(followed.flapping);
         }
         assert_eq!(flapping, 1);
+    }
+
+    #[test]
+    fn a_step_that_a_busy_machine_sees_late_keeps_the_streams_together() {
+        for (by, stalled) in [(-300, 250), (500, 300), (-3_600_000, 900), (3_600_000, 900)] {
+            let mut follower = ClockFollower::new(Stamp(0), Stamp(0));
+            let mut worst = 0;
+            for i in 0..900_i64 {
+                let stamp = i * 10 * MS;
+                let (kind, latency) = if i % 5 == 4 {
+                    (Kind::Scan, 20)
+                } else {
+                    (Kind::Odometry, 1)
+                };
+                let set = if stamp >= 4_000 * MS { by * MS } else { 0 };
+                // The first odometry after the step comes late, the scans in time.
+                let late = if (4_000..4_030).contains(&(stamp / MS)) && kind == Kind::Odometry {
+                    stalled
+                } else {
+                    0
+                };
+                let arrival = stamp + (latency + late) * MS;
+                let followed = follower.follow(kind, Stamp(stamp + set), Stamp(arrival));
+                if stamp > 5_000 * MS {
+                    let shifts = [follower.scan.shift, follower.odometry.shift];
+                    worst = worst.max((shifts[0] - shifts[1]).abs());
+                    assert!((followed.stamp.0 - stamp).abs() < 1_000 * MS, "{by} {followed:?}");
+                }
+            }
+            assert_eq!(worst, 0, "{by} ms");
+        }
+    }
+
+    #[test]
+    fn a_sensor_that_begins_after_a_step_is_on_the_same_clock() {
+        let mut follower = ClockFollower::new(Stamp(0), Stamp(0));
+        for i in 0..400_i64 {
+            let stamp = i * 20 * MS;
+            let set = if i >= 100 { -3_600_000 * MS } else { 0 };
+            let followed = follower.follow(Kind::Odometry, Stamp(stamp + set), Stamp(stamp + MS));
+            assert!((followed.stamp.0 - stamp).abs() < 25 * MS);
+            if i >= 200 {
+                let imu = follower.follow(Kind::Imu, Stamp(stamp + set), Stamp(stamp + MS));
+                assert!((imu.stamp.0 - stamp).abs() < 25 * MS);
+            }
+        }
+    }
+
+    #[test]
+    fn a_clock_that_is_set_again_and_again_is_followed() {
+        let mut follower = ClockFollower::new(Stamp(0), Stamp(0));
+        let (mut newest, mut newest_at) = (i64::MIN, 0);
+        for i in 0..1_000_i64 {
+            let arrival = i * 20 * MS;
+            // Set every two seconds, by more each time, back and forth.
+            let times = arrival / (2_000 * MS);
+            let set = times * times * 700 * MS * (1 - 2 * (times % 2));
+            let followed = follower.follow(Kind::Odometry, Stamp(arrival + set), Stamp(arrival + MS));
+            if followed.stamp.0 > newest {
+                (newest, newest_at) = (followed.stamp.0, arrival);
+            }
+            assert!(
+                arrival - newest_at < 1_100 * MS,
+                "time stands still at {arrival} ns"
+            );
+        }
     }
 
     #[test]

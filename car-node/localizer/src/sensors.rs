@@ -28,6 +28,13 @@ pub struct Scan {
     pub ranges: Vec<f32>,
 }
 
+impl Scan {
+    /// Time from the first beam to the last \[s\].
+    pub fn sweep(&self) -> f64 {
+        self.time_increment * self.ranges.len().saturating_sub(1) as f64
+    }
+}
+
 /// A velocity in the frame of `base_link`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Twist {

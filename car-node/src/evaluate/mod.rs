@@ -155,6 +155,7 @@ pub fn run(
                     let true_pose = truth.at(update.stamp);
                     errors.push(update.stamp, update.pose, true_pose);
                     consistency.push(&update, true_pose);
+                    monitor.on_sweep(scan.sweep());
                     let state = monitor.on_update(&update, arrival.log_time).state;
                     states.push(update.stamp, state, update.pose, true_pose);
                     alignment.push(update.alignment);

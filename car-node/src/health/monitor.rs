@@ -61,6 +61,8 @@ pub struct Monitor {
     /// What the localizer has found to be wrong with its sensors.
     sensors: SensorFindings,
     ages: PoseAges,
+    /// How long a scan takes, from its first beam to its last \[s\].
+    sweep: f64,
     /// The last jump of the odometry: when, and how far \[m\].
     odometry_jump: Option<(Stamp, f64)>,
     /// The last jump of a pose that was trusted: when, and how far \[m\].
@@ -100,6 +102,7 @@ impl Monitor {
             repeating_since: None,
             sensors: SensorFindings::default(),
             ages: PoseAges::default(),
+            sweep: 0.0,
             odometry_jump: None,
             pose_jump: None,
             clock_step: None,
@@ -176,6 +179,15 @@ impl Monitor {
         self.enter(State::Relocalizing, now);
     }
 
+    /// The scan of the next update took this long, from its first beam to its last \[s\]. No pose at its first beam can be younger.
+    pub fn on_sweep(&mut self, seconds: f64) {
+        self.sweep = if seconds.is_finite() {
+            seconds.max(0.0)
+        } else {
+            0.0
+        };
+    }
+
     /// A scan led to an update; its pose was ready at `now`.
     pub fn on_update(&mut self, update: &Update, now: Stamp) -> &Verdict {
         self.silence.on_scan(now);
@@ -205,7 +217,14 @@ impl Monitor {
             doubt: update.doubt,
             good: self.verdict.state == State::Localized,
         };
-        self.findings = findings(&evidence, &self.thresholds);
+        let limits = Thresholds {
+            age: self
+                .thresholds
+                .age
+                .max(self.sweep + self.thresholds.age_after_sweep),
+            ..self.thresholds
+        };
+        self.findings = findings(&evidence, &limits);
         self.note_times(fast, update.stamp);
         // Driven by odometry: a wrong pose moves about even while the car stands.
         if let (Some(_), Some(last)) = (self.good_since, self.last_update) {
@@ -910,5 +929,23 @@ mod tests {
             kinds.contains(&CauseKind::ClockStep) && !kinds.contains(&CauseKind::Age),
             "{kinds:?}"
         );
+    }
+
+    #[test]
+    fn a_scan_that_takes_long_is_no_late_scan() {
+        let causes = |sweep: f64, age: f64| {
+            let start = Stamp(1_000_000_000);
+            let mut monitor = Monitor::new(Thresholds::default(), start);
+            for i in 0..40 {
+                let stamp = start.plus(0.1 * i as f64);
+                let update = good_update(stamp, i);
+                monitor.on_sweep(sweep);
+                monitor.on_update(&update, stamp.plus(age));
+            }
+            let kinds: Vec<_> = monitor.verdict().causes.iter().map(|cause| cause.kind).collect();
+            kinds.contains(&CauseKind::Age)
+        };
+        assert!(causes(0.0, 0.1) && causes(0.0187, 0.1));
+        assert!(!causes(0.09, 0.1) && causes(0.09, 0.2));
     }
 }

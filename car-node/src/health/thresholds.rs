@@ -60,6 +60,8 @@ pub struct Thresholds {
     pub leap: f64,
     /// Median age of poses above this is degraded \[s\]. A busy car has 40 ms: a scan arrives 17 to 22 ms after its stamp.
     pub age: f64,
+    /// Where a scan takes long, a pose at its first beam may be so much older than the sweep \[s\].
+    pub age_after_sweep: f64,
     /// Sensor data is missing after this long \[s\]. A real log has harmless gaps of 0.14 s in its odometry.
     pub stale_after: f64,
     /// Time constant with which the fit is smoothed before it degrades the state \[s\].
@@ -110,6 +112,7 @@ impl Default for Thresholds {
             innovation_angle: 10_f64.to_radians(),
             leap: 1.0,
             age: 0.080,
+            age_after_sweep: 0.060,
             stale_after: 0.4,
             smoothing: 0.25,
             smoothing_lost: 0.1,

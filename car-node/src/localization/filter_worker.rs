@@ -438,6 +438,7 @@ impl FilterWorker {
             shared.telemetry.pose(report);
         }
 
+        self.config.monitor.on_sweep(scan.sweep());
         self.config.monitor.on_update(&update, now);
         self.watch_slip(&update);
         self.announce_findings();

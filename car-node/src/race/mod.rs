@@ -462,6 +462,7 @@ impl CarRunner {
                 return None;
             }
         };
+        monitor.on_sweep(scan.sweep());
         let state = monitor.on_update(&update, now).state;
         self.measurements.judged(update.stamp, state, update.pose, truth);
         let twist = [update.twist.linear_x, update.twist.angular];

@@ -7,6 +7,7 @@ pub(crate) mod external_pose;
 pub mod frames;
 mod ros2;
 mod simulated;
+mod sweep_stamps;
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};

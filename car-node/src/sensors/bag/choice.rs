@@ -10,6 +10,7 @@ use super::{
 use crate::ros2::messages::{LaserScan, RosOdometry};
 use crate::sensors::external_pose::PoseFrames;
 use crate::sensors::frames::{BASE_LINK, Frames, Mount, is_base};
+use crate::sensors::sweep_stamps::EndStamps;
 use crate::statistics::percentile;
 
 /// Stamps of a sensor that are this far from those of the others are of another clock \[s\].
@@ -457,35 +458,20 @@ fn events<T>(messages: &[(Stamp, T)], event: impl Fn(&T) -> SensorEvent) -> Vec<
         .collect()
 }
 
-/// Stamps of the last beam become those of the first. A scan cannot arrive before its sweep has ended: one that is there before
-/// half of its sweep after its stamp was stamped at the end.
+/// Stamps of the last beam become those of the first.
 fn stamps_to_first_beams(topic: &str, scans: &mut [Arrival], notes: &mut Vec<String>) {
-    /// Sweeps that are corrected last this long \[s\]. A pose at the first beam of a longer one would be too old for the health state.
-    const SWEEPS: std::ops::Range<f64> = 1e-3..0.04;
-    /// So many of the scans must have come so early.
-    const MOST: f64 = 0.9;
     let sweep = |arrival: &Arrival| match &arrival.event {
-        SensorEvent::Scan(scan) => scan.time_increment * scan.ranges.len().saturating_sub(1) as f64,
+        SensorEvent::Scan(scan) => scan.sweep(),
         _ => 0.0,
     };
-    let early: Vec<f64> = scans
+    let ages: Vec<[f64; 2]> = scans
         .iter()
-        .map(|arrival| (arrival, sweep(arrival)))
-        .filter(|(_, sweep)| SWEEPS.contains(sweep))
-        .map(|(arrival, sweep)| arrival.log_time.since(arrival.event.stamp()) / sweep)
+        .map(|arrival| [arrival.log_time.since(arrival.event.stamp()), sweep(arrival)])
         .collect();
-    let Some(latest) = percentile(&early, MOST) else {
+    let Some(found) = EndStamps::find(&ages) else {
         return;
     };
-    if early.len() < scans.len() || !(-0.5..0.5).contains(&latest) {
-        return;
-    }
-    let milliseconds = sweep(&scans[0]) * 1e3;
-    notes.push(format!(
-        "{topic}: scans arrive {:.1} ms after their stamps, and a sweep takes {milliseconds:.1} ms: the stamps are taken to be of the \
-         last beam",
-        latest * milliseconds
-    ));
+    notes.push(found.text(topic));
     for arrival in scans {
         let sweep = sweep(arrival);
         let stamp = arrival.event.stamp_mut();

@@ -39,6 +39,7 @@ use crate::sensors::bag::{SensorEvent, Topics};
 use crate::sensors::clock::{SensorClock, StampShift, wall_now};
 use crate::sensors::external_pose::{PoseFrames, PoseMessage};
 use crate::sensors::frames::{Frames, Mount};
+use crate::sensors::sweep_stamps::LiveSweepStamps;
 
 /// Which ROS side to connect to, and which topics to take.
 #[derive(Debug, Clone, PartialEq)]
@@ -171,6 +172,7 @@ pub struct Ros2 {
     base_link_from_imu: UnitQuaternion<f64>,
     clock: SensorClock,
     follower: ClockFollower,
+    sweep_stamps: LiveSweepStamps,
     /// Arrivals are counted from here.
     epoch: Instant,
     /// Odometry has come; scans before that are of no use.
@@ -261,6 +263,7 @@ impl Ros2 {
             given: options.mount.is_some(),
             guessed: mount.is_none(),
             follower: ClockFollower::new(Stamp(0), clock.now()),
+            sweep_stamps: LiveSweepStamps::default(),
             epoch: Instant::now(),
             clock,
             ros: RosConnection {
@@ -360,7 +363,11 @@ impl Ros2 {
                     return self.skip_scan();
                 }
                 let mut scan = scan.to_scan(self.mount.upside_down);
-                scan.stamp = stamp;
+                let (age, sweep) = (self.clock.at(arrival).since(stamp), scan.sweep());
+                if let Some(found) = self.sweep_stamps.learn(age, sweep) {
+                    self.pending.push_back(Feed::Log(found.text(&topic)));
+                }
+                scan.stamp = self.sweep_stamps.first_beam(stamp, sweep);
                 Some(Feed::Sensor(SensorEvent::Scan(scan)))
             }
             Ok(Content::Odometry(odometry)) if topic == self.choice.odometry => {

@@ -1,7 +1,8 @@
 //! This node in the ROS graph: keys, liveliness tokens, attachments and publishers, without ROS.
 //!
 //! `rmw_zenoh` names a topic `<domain>/<topic>/<type>/<hash>`, announces every node and endpoint by a liveliness token, and sends 33 bytes
-//! beside each message (its `design.md`). A zenoh-bridge-ros2dds names a topic `<topic>`; a plain put on that key reaches DDS.
+//! beside each message (its `design.md`). A zenoh-bridge-ros2dds names a topic `<topic>`; a plain put on that key reaches DDS. Bridges announce
+//! topics and services to each other by tokens of their own, and this node announces its own in the same way, so that they are listed in DDS.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -93,7 +94,19 @@ impl Durability {
             Self::Latched(depth) => format!(":1:,{depth}:,:,:,,"),
         }
     }
+
+    /// The same as a bridge's token spells it, with DDS's numbers, and the type's hash as DDS carries it.
+    fn bridged_qos(self, hash: &str) -> String {
+        let (durability, depth) = match self {
+            Self::Volatile => (0, 10),
+            Self::Latched(depth) => (1, depth),
+        };
+        format!(":1:{durability}:0,{depth}:typehash={hash};{OWN_MARK}")
+    }
 }
+
+/// Tells the tokens of a car-node from those of a bridge.
+const OWN_MARK: &str = "node=synpf;";
 
 /// Our node's name in the ROS graph.
 pub const NODE: &str = "synpf";
@@ -101,6 +114,11 @@ pub const NODE: &str = "synpf";
 /// A name with its slashes replaced, as tokens have it.
 fn mangled(name: &str) -> String {
     name.replace('/', "%")
+}
+
+/// The same in a bridge's tokens.
+fn bridge_mangled(name: &str) -> String {
+    name.trim_matches('/').replace('/', "§")
 }
 
 /// This node in the ROS graph, with its token.
@@ -114,7 +132,7 @@ pub struct RosNode {
     token: Option<LivelinessToken>,
 }
 
-/// An endpoint's token, and its identity in attachments; both only with `rmw_zenoh`.
+/// An endpoint's token, and its identity in attachments, which only `rmw_zenoh` has.
 pub struct Announced {
     gid: Option<[u8; 16]>,
     _token: Option<LivelinessToken>,
@@ -167,7 +185,7 @@ impl RosNode {
         }
     }
 
-    /// Announces an endpoint of this node; does nothing behind a bridge.
+    /// Announces an endpoint of this node.
     pub fn announce_endpoint(
         &self,
         kind: EndpointKind,
@@ -176,9 +194,11 @@ impl RosNode {
         durability: Durability,
     ) -> zenoh::Result<Announced> {
         let Some(root) = self.token_root() else {
+            let token = bridge_token(&self.session.zid().to_string(), kind, topic, ros_type, durability);
+            let token = self.session.liveliness().declare_token(token).wait()?;
             return Ok(Announced {
                 gid: None,
-                _token: None,
+                _token: Some(token),
             });
         };
         let token = format!(
@@ -197,6 +217,32 @@ impl RosNode {
             gid: Some(gid),
             _token: Some(token),
         })
+    }
+
+    /// The tokens of all publishers of a topic.
+    pub fn tokens_of_publishers(&self, topic: &str, ros_type: RosType) -> String {
+        match &self.naming {
+            Naming::RmwZenoh { domain, .. } => format!(
+                "@ros2_lv/{domain}/*/*/*/MP/*/*/*/%{}/{}/*/*",
+                mangled(topic.trim_matches('/')),
+                ros_type.dds
+            ),
+            Naming::Bridge => format!("@/*/@ros2_lv/MP/{}/**", bridge_mangled(topic)),
+        }
+    }
+
+    /// True for the token of a publisher that this node leaves a topic to: one of another node. Of two car-nodes, the one with the greater
+    /// session number leaves it.
+    pub fn yields_to(&self, token: &str) -> bool {
+        let (place, ours) = match &self.naming {
+            Naming::RmwZenoh { .. } => (2, token.split('/').nth(8) == Some(NODE)),
+            Naming::Bridge => (1, token.ends_with(OWN_MARK)),
+        };
+        let own = self.session.zid().to_string();
+        token
+            .split('/')
+            .nth(place)
+            .is_some_and(|zid| if ours { zid < own.as_str() } else { zid != own })
     }
 
     /// A publisher on a topic, announced.
@@ -234,6 +280,26 @@ impl Announced {
     /// The attachment to message or reply number `sequence`; None behind a bridge.
     pub fn attachment(&self, sequence: i64) -> Option<Vec<u8>> {
         self.gid.map(|gid| attachment(sequence, wall_now(), &gid))
+    }
+}
+
+/// The token by which a bridge with this session number would announce an endpoint.
+fn bridge_token(
+    zid: &str,
+    kind: EndpointKind,
+    topic: &str,
+    ros_type: RosType,
+    durability: Durability,
+) -> String {
+    let letters = kind.letters();
+    let topic = bridge_mangled(topic);
+    let name = bridge_mangled(&ros_type.name());
+    match kind {
+        EndpointKind::Service => format!("@/{zid}/@ros2_lv/{letters}/{topic}/{name}"),
+        EndpointKind::Publisher | EndpointKind::Subscriber => {
+            let qos = durability.bridged_qos(ros_type.hash);
+            format!("@/{zid}/@ros2_lv/{letters}/{topic}/{name}/{qos}")
+        }
     }
 }
 
@@ -296,9 +362,12 @@ pub fn token_of_subscriber(
     )
 }
 
-/// What `rmw_zenoh` sends beside each message: sequence number, time, and publisher; 33 bytes.
+/// Bytes that `rmw_zenoh` sends beside each message, request and reply.
+pub const ATTACHMENT_LENGTH: usize = 33;
+
+/// What `rmw_zenoh` sends beside each message: sequence number, time, and publisher.
 fn attachment(sequence: i64, sent: Stamp, gid: &[u8; 16]) -> Vec<u8> {
-    let mut bytes = Vec::with_capacity(33);
+    let mut bytes = Vec::with_capacity(ATTACHMENT_LENGTH);
     bytes.extend(sequence.to_le_bytes());
     bytes.extend(sent.0.to_le_bytes());
     bytes.push(gid.len() as u8);
@@ -317,7 +386,33 @@ mod tests {
         let ours = attachment(3, Stamp(1_700_000_000_000_000_001), &gid);
         let theirs = zenoh_ext::z_serialize(&(3_i64, 1_700_000_000_000_000_001_i64, gid.to_vec()));
         assert_eq!(ours, theirs.to_bytes().as_ref());
-        assert_eq!(ours.len(), 33);
+        assert_eq!(ours.len(), ATTACHMENT_LENGTH);
+    }
+
+    #[test]
+    fn tokens_for_a_bridge_are_as_bridges_write_them() {
+        let qos = format!("typehash={};node=synpf;", POSE_STAMPED.hash);
+        assert_eq!(
+            bridge_token(
+                "ab1",
+                EndpointKind::Publisher,
+                "/car1/tracked_pose",
+                POSE_STAMPED,
+                Durability::Volatile
+            ),
+            format!("@/ab1/@ros2_lv/MP/car1§tracked_pose/geometry_msgs§msg§PoseStamped/:1:0:0,10:{qos}")
+        );
+        assert_eq!(
+            bridge_token(
+                "ab1",
+                EndpointKind::Service,
+                "/synpf/get",
+                crate::ros2::types::EMPTY,
+                Durability::Volatile
+            ),
+            "@/ab1/@ros2_lv/SS/synpf§get/std_srvs§srv§Empty"
+        );
+        assert!(Durability::Latched(1).bridged_qos("h").starts_with(":1:1:0,1:"));
     }
 
     #[test]

@@ -4,19 +4,19 @@
 use std::fmt::Write as _;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
 
-use crossbeam_channel::{Receiver, bounded};
+use crossbeam_channel::{Receiver, bounded, select};
 use maps::{Cell, OccupancyGrid};
 use nalgebra::Matrix3;
 use protocol::{Severity, State};
 use synpf::{Stamp, Twist};
-use zenoh::{Session, Wait};
+use zenoh::Session;
 
 use super::graph::{Durability, NODE, Naming, RosNode, RosPublisher};
+use super::map_server::MapServer;
 use super::messages::{
     Covariance, DiagnosticArray, DiagnosticStatus, Header, KeyValue, Log, PoseArray, PoseStamped,
-    PoseWithCovarianceStamped, RosGrid, RosOdometry, RosPose, TfMessage, TransformStamped, Vector3,
+    PoseWithCovarianceStamped, RosGrid, RosOdometry, RosPose, TfMessage, Time, TransformStamped, Vector3,
 };
 use super::output::{PoseOutput, RosOutput, RosSink};
 use super::{topics, types};
@@ -60,8 +60,6 @@ impl Default for OutputOptions {
 
 /// Messages that wait to be sent.
 const QUEUE: usize = 32;
-/// How long to wait for an answer to whether another node serves the map.
-const MAP_SERVERS: Duration = Duration::from_millis(500);
 /// Log messages that late subscribers get.
 const LOGS_KEPT: usize = 16;
 
@@ -93,14 +91,8 @@ pub fn start(
         .pose_topic
         .clone()
         .unwrap_or_else(|| in_namespace(topics::POSE_ODOMETRY));
-    let map_topic = in_namespace(topics::MAP);
-    let map = if serves_map(node, &map_topic) {
-        None
-    } else {
-        let mut publisher = node.publisher(&map_topic, types::OCCUPANCY_GRID, Durability::Latched(1))?;
-        publisher.publish(&grid_message(map, connection.shift.to_sensor(wall_now())));
-        Some(publisher)
-    };
+    let grid = grid_message(map, connection.shift.to_sensor(wall_now()));
+    let map = MapServer::start(node, in_namespace(topics::MAP), grid)?;
     let publishers = Publishers {
         odometry: plain(&pose_topic, types::ODOMETRY)?,
         inferred: plain(&in_namespace(topics::INFERRED_POSE), types::POSE_STAMPED)?,
@@ -116,10 +108,10 @@ pub fn start(
             .transpose()?,
         diagnostics: plain(topics::DIAGNOSTICS, types::DIAGNOSTIC_ARRAY)?,
         log: node.publisher(topics::LOG, types::LOG, Durability::Latched(LOGS_KEPT))?,
-        _map: map,
     };
     let worker = OutputPublisher {
         publishers,
+        map,
         shift: connection.shift.clone(),
         odom: connection.odom.clone(),
         base_link: connection.base_link.clone(),
@@ -134,27 +126,6 @@ pub fn start(
     Ok((sink, thread))
 }
 
-/// True when another node publishes the map.
-fn serves_map(node: &RosNode, topic: &str) -> bool {
-    let name = topic.trim_matches('/');
-    let tokens = match node.naming() {
-        Naming::RmwZenoh { domain, .. } => format!(
-            "@ros2_lv/{domain}/*/*/*/MP/*/*/*/%{}/{}/*/*",
-            name.replace('/', "%"),
-            types::OCCUPANCY_GRID.dds
-        ),
-        // A bridge writes the slashes of a name as this sign.
-        Naming::Bridge => format!("@/*/@ros2_lv/MP/{}/**", name.replace('/', "§")),
-    };
-    let replies = node
-        .session()
-        .liveliness()
-        .get(tokens)
-        .timeout(MAP_SERVERS)
-        .wait();
-    replies.is_ok_and(|replies| replies.iter().any(|reply| reply.result().is_ok()))
-}
-
 struct Publishers {
     odometry: RosPublisher,
     inferred: RosPublisher,
@@ -164,12 +135,11 @@ struct Publishers {
     transform: Option<RosPublisher>,
     diagnostics: RosPublisher,
     log: RosPublisher,
-    /// Keeps the map for late subscribers.
-    _map: Option<RosPublisher>,
 }
 
 struct OutputPublisher {
     publishers: Publishers,
+    map: MapServer,
     shift: StampShift,
     odom: String,
     base_link: String,
@@ -181,40 +151,55 @@ struct OutputPublisher {
 
 impl OutputPublisher {
     fn run(mut self, outputs: &Receiver<RosOutput>) {
-        for output in outputs {
-            match output {
-                RosOutput::Pose(pose) => self.pose(&pose),
-                RosOutput::Particles { stamp, poses } => {
-                    let message = PoseArray {
-                        header: self.header(stamp, "map"),
-                        poses: poses.into_iter().map(RosPose::from).collect(),
-                    };
-                    self.publishers.particles.publish(&message);
-                }
-                RosOutput::Health(report) => {
-                    let message = DiagnosticArray {
-                        header: self.header(report.stamp, ""),
-                        status: vec![diagnosis(&report, &self.car, self.last_log.as_deref())],
-                    };
-                    self.publishers.diagnostics.publish(&message);
-                }
-                RosOutput::Log {
-                    stamp,
-                    severity,
-                    text,
-                } => {
-                    let message = Log {
-                        stamp: self.shift.to_sensor(stamp).into(),
-                        level: log_level(severity),
-                        name: self.node.full_name().trim_matches('/').replace('/', "."),
-                        msg: text.clone(),
-                        ..Log::default()
-                    };
-                    self.publishers.log.publish(&message);
-                    self.last_log = Some(text);
-                }
+        loop {
+            select! {
+                recv(outputs) -> output => match output {
+                    Ok(output) => self.publish(output),
+                    Err(_) => return,
+                },
+                recv(self.map.changes()) -> _ => self.map.on_change(),
+                recv(self.map.settled()) -> _ => if let Some(text) = self.map.on_settled() {
+                    self.log(wall_now().into(), Severity::Info, text);
+                },
             }
         }
+    }
+
+    fn publish(&mut self, output: RosOutput) {
+        match output {
+            RosOutput::Pose(pose) => self.pose(&pose),
+            RosOutput::Particles { stamp, poses } => {
+                let message = PoseArray {
+                    header: self.header(stamp, "map"),
+                    poses: poses.into_iter().map(RosPose::from).collect(),
+                };
+                self.publishers.particles.publish(&message);
+            }
+            RosOutput::Health(report) => {
+                let message = DiagnosticArray {
+                    header: self.header(report.stamp, ""),
+                    status: vec![diagnosis(&report, &self.car, self.last_log.as_deref())],
+                };
+                self.publishers.diagnostics.publish(&message);
+            }
+            RosOutput::Log {
+                stamp,
+                severity,
+                text,
+            } => self.log(self.shift.to_sensor(stamp).into(), severity, text),
+        }
+    }
+
+    fn log(&mut self, stamp: Time, severity: Severity, text: String) {
+        let message = Log {
+            stamp,
+            level: log_level(severity),
+            name: self.node.full_name().trim_matches('/').replace('/', "."),
+            msg: text.clone(),
+            ..Log::default()
+        };
+        self.publishers.log.publish(&message);
+        self.last_log = Some(text);
     }
 
     fn header(&self, stamp: Stamp, frame: &str) -> Header {

@@ -1,7 +1,8 @@
 //! The services of this node: its parameters, as every ROS node has them, and AMCL's `/reinitialize_global_localization`.
 //!
 //! With `rmw_zenoh` a service is a queryable on `<domain>/<service>/<type>/<hash>`. Request and reply are CDR; the attachment of
-//! the request comes back with the reply. The parameters are those of the set in force, and `set`, its name. A change goes the
+//! the request comes back with the reply. Behind a zenoh-bridge-ros2dds it is a queryable on `<service>`, with the same CDR; the bridge keeps
+//! what identifies the request. The parameters are those of the set in force, and `set`, its name. A change goes the
 //! way of a pit wall's command: it is checked, shown and recorded like any other.
 
 use std::thread::{self, JoinHandle};
@@ -12,7 +13,7 @@ use serde::Serialize;
 use zenoh::Wait;
 use zenoh::query::{Query, Queryable};
 
-use super::graph::{Announced, Durability, EndpointKind, RosNode, RosPublisher};
+use super::graph::{ATTACHMENT_LENGTH, Announced, Durability, EndpointKind, RosNode, RosPublisher};
 use super::messages::{CdrError, decode, encode};
 use super::output_publisher::RosConnection;
 use super::parameter_messages::{
@@ -181,11 +182,11 @@ impl Server {
                 return;
             }
         };
-        // The sender finds its request by the number and the identity that it sent along.
+        // The sender finds its request by the number and the identity that it sent along. A bridge's attachment has no time.
         let attachment = query.attachment().map(|bytes| {
             let mut bytes = bytes.to_bytes().into_owned();
-            if let Some(time) = bytes.get_mut(8..16) {
-                time.copy_from_slice(&wall_now().0.to_le_bytes());
+            if bytes.len() == ATTACHMENT_LENGTH {
+                bytes[8..16].copy_from_slice(&wall_now().0.to_le_bytes());
             }
             bytes
         });

@@ -41,7 +41,8 @@ LASER_AHEAD = 0.27
 BEAMS = 181
 FIELD = math.radians(270)
 SCAN_PERIOD, ODOMETRY_PERIOD = 0.05, 0.02
-SCAN_LATENCY, ODOMETRY_LATENCY = 0.015, 0.001
+# From a stamp to the arrival, as a real car has it.
+SCAN_LATENCY, ODOMETRY_LATENCY = 0.020, 0.001
 
 
 def make(name, /, **fields):
@@ -85,6 +86,16 @@ def quaternion(yaw=0.0, roll=0.0):
     """Only one of the two turns."""
     x, z = math.sin(roll / 2), math.sin(yaw / 2)
     return make("geometry_msgs/msg/Quaternion", x=x, y=0.0, z=z, w=math.cos((yaw or roll) / 2))
+
+
+def transform(frame, child, x, y, yaw=0.0, roll=0.0, z=0.0):
+    translation = make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=z)
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(time.time_ns(), frame),
+        child_frame_id=child,
+        transform=make("geometry_msgs/msg/Transform", translation=translation, rotation=quaternion(yaw, roll)),
+    )
 
 
 def ros_pose(x, y, yaw):
@@ -148,14 +159,16 @@ class Node:
             self.announce(f"@ros2_lv/{domain}/{self.zid}/0/0/NN/%/%/{name}")
 
     def announce(self, token):
-        self.tokens.append(self.session.liveliness().declare_token(token))
+        self.tokens.append((token, self.session.liveliness().declare_token(token)))
 
     def key(self, topic, name):
         topic = topic.strip("/")
         return topic if self.bridge else f"{self.domain}/{topic}/{dds(name)}/{TYPES.hash_rihs01(name)}"
 
     def put(self, topic, message, latched=False):
-        name = message.__msgtype__
+        self.put_bytes(topic, message.__msgtype__, encode(message), latched)
+
+    def put_bytes(self, topic, name, payload, latched=False):
         if topic not in self.publishers:
             key = self.key(topic, name)
             if latched:
@@ -176,12 +189,29 @@ class Node:
         attachment = None
         if not self.bridge:
             attachment = struct.pack("<qqB", self.sequence, time.time_ns(), 16) + bytes(16)
-        self.publishers[topic].put(encode(message), attachment=attachment)
+        self.publishers[topic].put(payload, attachment=attachment)
+
+    def withdraw(self, topic):
+        """Publishes on a topic no more."""
+        mangled = "%" + topic.strip("/").replace("/", "%")
+        for token, declared in list(self.tokens):
+            if f"/MP/%/%/{self.name}/{mangled}/" in token:
+                declared.undeclare()
+                self.tokens.remove((token, declared))
+        self.publishers.pop(topic).undeclare()
 
     def call(self, service, type_, request):
-        """The reply of a service, and its attachment."""
-        key = f"{self.domain}/{service.strip('/')}/{type_}/{SERVICES[type_]}"
+        """The reply of a service, as rmw_zenoh or a bridge asks for it."""
         self.calls += 1
+        if self.bridge:
+            # The client and the number of the request, in a form of the bridge's own. It looks at the payload of the reply only.
+            attachment = b"\x01" + b"rqh" + struct.pack("<QqB", 7, self.calls, 1)
+            for reply in self.session.get(service.strip("/"), payload=encode(request), attachment=attachment, timeout=5.0):
+                payload = bytes(reply.ok.payload)
+                assert payload[1] == 1 and len(payload) > 4, "CDR begins with its four bytes"
+                return payload
+            raise AssertionError(f"{service} does not answer")
+        key = f"{self.domain}/{service.strip('/')}/{type_}/{SERVICES[type_]}"
         attachment = struct.pack("<qqB", self.calls, time.time_ns(), 16) + bytes(range(16))
         replies = self.session.get(
             key, payload=encode(request), attachment=attachment, target=zenoh.QueryTarget.ALL_COMPLETE, timeout=5.0
@@ -199,11 +229,11 @@ class Track:
 
     SPEED = 3.0
 
-    def __init__(self, folder):
+    def __init__(self, folder, beams=BEAMS, period=SCAN_PERIOD, sweep=0.0):
+        self.beams, self.scan_period, self.sweep = beams, period, sweep
         line = np.loadtxt(folder / "raceline.csv", delimiter=";", usecols=(0, 1, 2, 3))
         self.s, self.points = line[:, 0], line[:, 1:3]
-        # In the file, 0 is north.
-        self.headings = np.unwrap(line[:, 3]) + math.pi / 2
+        self.headings = np.unwrap(line[:, 3])
         walls = np.genfromtxt(folder / "walls.csv", delimiter=";", usecols=(0, 2, 3))
         begin, end = [], []
         for wall in np.unique(walls[:, 0]):
@@ -223,7 +253,14 @@ class Track:
         # A whole number of scans and of odometry messages to the lap.
         self.period = round(self.length / self.SPEED / 0.1) * 0.1
         random = np.random.default_rng(0)
-        self.scans = [self.scan(i * SCAN_PERIOD, random) for i in range(round(self.period / SCAN_PERIOD))]
+        self.scans = [self.scan(i * period, random) for i in range(round(self.period / period))]
+
+    def swept(self, sweep):
+        """The same lap, seen by a lidar that takes so long for a scan [s]: each beam from where the car is then."""
+        other = copy.copy(self)
+        other.sweep, random = sweep, np.random.default_rng(0)
+        other.scans = [other.scan(i * self.scan_period, random) for i in range(len(self.scans))]
+        return other
 
     def upside_down_lidar(self):
         """The same lap, seen by a lidar that is upside down: its beams come in the other order."""
@@ -233,6 +270,7 @@ class Track:
 
     def standing(self):
         """A car that stands in a room without walls."""
+        self.beams, self.scan_period, self.sweep = BEAMS, SCAN_PERIOD, 0.0
         self.period, self.scans = 0.1, [np.full(BEAMS, 5.0, dtype=np.float32)] * 2
         self.length, self.s = 1.0, np.array([0.0, 1.0])
         self.points, self.headings = np.zeros((2, 2)), np.zeros(2)
@@ -240,79 +278,87 @@ class Track:
         return self
 
     def pose(self, t):
-        """Where the car is."""
+        """Where the car is: x, y and heading, at one time or at many."""
         s = (t % self.period) / self.period * self.length
         x, y = (np.interp(s, self.s, self.points[:, i]) for i in (0, 1))
-        return x, y, float(np.interp(s, self.s, self.headings))
+        return x, y, np.interp(s, self.s, self.headings)
 
     def scan(self, t, random):
-        x, y, yaw = compose(self.pose(t), (LASER_AHEAD, 0, 0))
-        angles = yaw + np.linspace(-FIELD / 2, FIELD / 2, BEAMS)
+        along = np.linspace(0, 1, self.beams)
+        x, y, heading = self.pose(t + along * self.sweep)
+        x, y = x + LASER_AHEAD * np.cos(heading), y + LASER_AHEAD * np.sin(heading)
+        angles = heading + (along - 0.5) * FIELD
         d = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
         e = (self.b - self.a)[None]
-        w = (self.a - (x, y))[None]
+        w = self.a[None] - np.stack([x, y], axis=1)[:, None, :]
         cross = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
             range_ = (w[..., 0] * e[..., 1] - w[..., 1] * e[..., 0]) / cross
-            along = (w[..., 0] * d[..., 1] - w[..., 1] * d[..., 0]) / cross
-        range_[~((range_ > 0) & (along >= 0) & (along <= 1))] = np.inf
-        return (range_.min(axis=1) + random.normal(0, 0.01, BEAMS)).astype(np.float32)
+            part = (w[..., 0] * d[..., 1] - w[..., 1] * d[..., 0]) / cross
+        range_[~((range_ > 0) & (part >= 0) & (part <= 1))] = np.inf
+        return (range_.min(axis=1) + random.normal(0, 0.01, self.beams)).astype(np.float32)
 
 
 class Car:
-    """Drives along the track and publishes. `offset` is the sensors' clock less this machine's [s]; `paused` stops time."""
+    """Drives along the track and publishes.
+
+    `offset` is the sensors' clock less this machine's [s]; `paused` stops time; `rate` is how fast it goes. With `gyroscope`, an IMU
+    sends so many times the yaw rate. `stamped_at_end` stamps a scan when its sweep has ended. `set_out` keeps when each message of
+    odometry was sent, by stamp.
+    """
 
     # `map_from_odom`
     ODOM = (1.0, 2.0, 0.3)
 
-    def __init__(self, node, track, namespace="", transforms=True, shift=0.0):
+    def __init__(self, node, track, namespace="", transforms=True, shift=0.0, gyroscope=None, stamped_at_end=False):
         self.node, self.track, self.namespace = node, track, namespace
-        self.offset = 0.0
+        self.offset, self.rate = 0.0, 1.0
+        self.gyroscope, self.stamped_at_end = gyroscope, stamped_at_end
         self.paused = threading.Event()
-        self.truth = {}
+        self.truth, self.set_out = {}, {}
         self.ended = threading.Event()
         self.shift = shift
+        # What is due next, by the time on the track.
+        scan_due = track.sweep + SCAN_LATENCY
+        self.streams = {"odometry": (ODOMETRY_PERIOD, ODOMETRY_LATENCY), "scan": (track.scan_period, scan_due)}
+        if gyroscope is not None:
+            self.streams["imu"] = (ODOMETRY_PERIOD / 2, ODOMETRY_LATENCY)
         if transforms:
             self.send_transforms()
         self.thread = threading.Thread(target=self.drive, daemon=True)
         self.thread.start()
 
     def send_transforms(self):
-        transform = make(
-            "geometry_msgs/msg/Transform",
-            translation=make("geometry_msgs/msg/Vector3", x=LASER_AHEAD, y=0.0, z=0.1),
-            rotation=quaternion(roll=math.pi if self.track.upside_down else 0.0),
-        )
-        stamped = make(
-            "geometry_msgs/msg/TransformStamped",
-            header=header(time.time_ns(), "base_link"),
-            child_frame_id="laser",
-            transform=transform,
-        )
+        roll = math.pi if self.track.upside_down else 0.0
+        stamped = transform("base_link", "laser", LASER_AHEAD, 0.0, roll=roll, z=0.1)
         self.node.put(f"{self.namespace}/tf_static", make("tf2_msgs/msg/TFMessage", transforms=[stamped]), latched=True)
 
     def drive(self):
-        t, wall = 0.0, time.monotonic()
-        due = [(0.0, "odometry"), (0.0, "scan")]
+        wall, at = time.monotonic(), 0.0
+        due = {kind: 0 for kind in self.streams}
         while not self.ended.is_set():
-            due.sort(key=lambda d: d[0] + (ODOMETRY_LATENCY if d[1] == "odometry" else SCAN_LATENCY))
-            t, kind = due[0]
-            latency = ODOMETRY_LATENCY if kind == "odometry" else SCAN_LATENCY
+            arrivals = {kind: number * self.streams[kind][0] + self.streams[kind][1] for kind, number in due.items()}
+            kind = min(arrivals, key=arrivals.get)
             if self.paused.is_set():
                 began = time.monotonic()
                 while self.paused.is_set():
                     time.sleep(0.01)
                 wall += time.monotonic() - began
-            time.sleep(max(0.0, wall + t + latency - time.monotonic()))
+            # The time on the track goes on from where it is, at the rate of now.
+            wall, at = wall + (arrivals[kind] - at) / self.rate, arrivals[kind]
+            time.sleep(max(0.0, wall - time.monotonic()))
+            t = due[kind] * self.streams[kind][0]
+            due[kind] += 1
             nanoseconds = round((self.begin_stamp() + t) * 1e9)
             pose = self.track.pose(t + self.shift)
             self.truth[nanoseconds] = pose
             if kind == "odometry":
                 self.send_odometry(nanoseconds, pose, t + self.shift)
-                due[0] = (round((t + ODOMETRY_PERIOD) / 0.01) * 0.01, kind)
+            elif kind == "imu":
+                self.send_imu(nanoseconds, t + self.shift)
             else:
-                self.send_scan(nanoseconds, t + self.shift)
-                due[0] = (round((t + SCAN_PERIOD) / 0.01) * 0.01, kind)
+                stamp = nanoseconds + round(self.track.sweep * 1e9) * self.stamped_at_end
+                self.send_scan(stamp, t + self.shift)
 
     def now(self):
         """Where the car is now."""
@@ -323,16 +369,24 @@ class Car:
             self.begun = time.time()
         return self.begun + self.offset
 
-    def send_odometry(self, nanoseconds, pose, t):
+    def motion(self, t):
+        """Speed and yaw rate."""
         dt = 0.01
         before, after = self.track.pose(t - dt), self.track.pose(t + dt)
         turn = (after[2] - before[2] + math.pi) % (2 * math.pi) - math.pi
-        speed = math.hypot(after[0] - before[0], after[1] - before[1]) / (2 * dt)
+        return math.hypot(after[0] - before[0], after[1] - before[1]) / (2 * dt), turn / (2 * dt)
+
+    def send_imu(self, nanoseconds, t):
+        rate = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=self.motion(t)[1] * self.gyroscope)
+        self.node.put(f"{self.namespace}/sensors/imu/raw", make("sensor_msgs/msg/Imu", header=header(nanoseconds, "imu"), angular_velocity=rate))
+
+    def send_odometry(self, nanoseconds, pose, t):
+        speed, turn = self.motion(t)
         x, y, yaw = compose(inverse(self.ODOM), pose)
         twist = make(
             "geometry_msgs/msg/Twist",
             linear=make("geometry_msgs/msg/Vector3", x=speed, y=0.0, z=0.0),
-            angular=make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=turn / (2 * dt)),
+            angular=make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=turn),
         )
         message = make(
             "nav_msgs/msg/Odometry",
@@ -341,18 +395,19 @@ class Car:
             pose=make("geometry_msgs/msg/PoseWithCovariance", pose=ros_pose(x, y, yaw), covariance=np.zeros(36)),
             twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
+        self.set_out[nanoseconds] = time.time_ns()
         self.node.put(f"{self.namespace}/odom", message)
 
     def send_scan(self, nanoseconds, t):
-        index = round((t % self.track.period) / SCAN_PERIOD) % len(self.track.scans)
+        index = round((t % self.track.period) / self.track.scan_period) % len(self.track.scans)
         message = make(
             "sensor_msgs/msg/LaserScan",
             header=header(nanoseconds, "laser"),
             angle_min=-FIELD / 2,
             angle_max=FIELD / 2,
-            angle_increment=FIELD / (BEAMS - 1),
-            time_increment=0.0,
-            scan_time=0.0,
+            angle_increment=FIELD / (self.track.beams - 1),
+            time_increment=self.track.sweep / (self.track.beams - 1),
+            scan_time=self.track.scan_period if self.track.sweep else 0.0,
             range_min=0.02,
             range_max=30.0,
             ranges=self.track.scans[index],

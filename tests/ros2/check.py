@@ -87,7 +87,7 @@ class Stalls:
     """Measures for how long this machine kept a thread waiting that had something to do [s]. A check that runs beside others' work
     allows for that, and for nothing else."""
 
-    LATE = 0.05
+    LATE = 0.02
 
     def __init__(self):
         self.total = 0.0

@@ -107,7 +107,7 @@ CAUSES = (
     "odometry_jump gyro_in_degrees gyro_flipped gyro_bias gyro_ignored gyro_always_zero odometry_turn_scale "
     "odometry_turn_bias odometry_turn_wrong twist_from_pose pose_from_twist wheel_scale creep wheels_slide "
     "sweep_from_scan_time time_increment_wrong range_max_wrong angle_increment_missing scan_lag repeated_scans "
-    "clock_step"
+    "clock_step map_differs"
 ).split()
 
 pose2 = record(x=f64, y=f64, heading=f64)

@@ -20,6 +20,8 @@ pub(super) struct CauseSources<'a> {
     pub(super) pose_jump: Option<f64>,
     /// A recent step of the sensors' clock \[s\].
     pub(super) clock_step: Option<f64>,
+    /// Length over which the map differs from what is seen \[m\].
+    pub(super) map_differs: f64,
     /// The localizer has given its pose up.
     pub(super) gave_up: bool,
     /// For how long scans have repeated \[s\]; None while they do not.
@@ -70,6 +72,10 @@ impl CauseSources<'_> {
             value: Some(finite(by)),
             ..plain(CauseKind::ClockStep, Severity::Info)
         });
+        let map_differs = (self.map_differs > 0.0).then(|| Cause {
+            value: Some(finite(self.map_differs)),
+            ..plain(CauseKind::MapDiffers, Severity::Info)
+        });
         let findings = self
             .findings
             .iter()
@@ -95,6 +101,7 @@ impl CauseSources<'_> {
             .chain(findings)
             .chain(repeating)
             .chain(clock_step)
+            .chain(map_differs)
             .chain(sensors)
             .collect();
         causes.sort_by_key(|cause| std::cmp::Reverse(cause.severity));

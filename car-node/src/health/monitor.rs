@@ -69,6 +69,7 @@ pub struct Monitor {
     pose_jump: Option<(Stamp, f64)>,
     /// When the sensors' clock was set last, and by how much \[s\].
     clock_step: Option<(Stamp, f64)>,
+    map_differs: f64,
     /// The state is LOST because the localizer gave its pose up, by a jump or a search, and for nothing else.
     given_up: bool,
     /// The state before STALE.
@@ -106,6 +107,7 @@ impl Monitor {
             odometry_jump: None,
             pose_jump: None,
             clock_step: None,
+            map_differs: 0.0,
             given_up: false,
             before_stale: State::Init,
         }
@@ -165,6 +167,11 @@ impl Monitor {
     /// The sensors' clock was set by this, back if negative \[s\]; stamps go on as before.
     pub fn on_clock_step(&mut self, now: Stamp, by: f64) {
         self.clock_step = Some((now, by));
+    }
+
+    /// The map differs from what the laser sees over this length in all \[m\].
+    pub fn on_map_differs(&mut self, length: f64) {
+        self.map_differs = length;
     }
 
     /// The localizer was given a new pose.
@@ -413,6 +420,7 @@ impl Monitor {
             odometry_jump: recent(self.odometry_jump),
             pose_jump: recent(self.pose_jump),
             clock_step: recent(self.clock_step),
+            map_differs: self.map_differs,
             gave_up: self.gave_up,
             repeating: self.repeating_since.map(|since| now.since(since)),
             sensors: self.sensors,

@@ -13,6 +13,7 @@ use synpf::{Dropped, ExternalPose, Hypothesis, Localizer, Odometry, Scan, Stamp,
 use super::filter_command::{FilterCommand, LocalizerChange};
 use super::job_worker::JobWorker;
 use super::lap_counter::LapCounter;
+use super::map_watch::MapWatch;
 use super::pace::Pace;
 use super::ros_feed::RosFeed;
 use super::shadow_channel::{ShadowInput, ShadowScan, ShadowSender};
@@ -85,6 +86,7 @@ struct FilterWorker {
     listed: Listed,
     /// Faults of sensors that an event was sent for.
     announced: Vec<CauseKind>,
+    map_watch: MapWatch,
     tables: TableWorker,
     jobs: JobWorker,
     ros: RosFeed,
@@ -116,6 +118,7 @@ pub fn start(
             last_external: None,
             listed: Listed::default(),
             announced: Vec::new(),
+            map_watch: MapWatch::default(),
             tables,
             jobs,
             ros,
@@ -442,6 +445,7 @@ impl FilterWorker {
         self.config.monitor.on_update(&update, now);
         self.watch_slip(&update);
         self.announce_findings();
+        self.watch_map(&update, &scan);
         if self.paces.cloud.due(update.stamp, rates.cloud) {
             // Every n-th particle; their order has no meaning, so this is a fair sample.
             let particles = self.config.localizer.particles(protocol::Cloud::MAX_PARTICLES);
@@ -550,6 +554,23 @@ impl FilterWorker {
         for cause in new {
             self.announced.push(cause.kind);
             let text = cause.to_string();
+            self.event(EventKind::Warning { text });
+        }
+    }
+
+    /// Tells where the map differs from what a localized car sees.
+    fn watch_map(&mut self, update: &Update, scan: &Scan) {
+        if self.config.monitor.verdict().state != State::Localized {
+            return;
+        }
+        let laser = update.pose * self.config.base_link_from_laser;
+        let stretches = self.map_watch.on_scan(scan, laser, &self.config.map);
+        if stretches.is_empty() {
+            return;
+        }
+        self.config.monitor.on_map_differs(self.map_watch.found());
+        for stretch in stretches {
+            let text = stretch.to_string();
             self.event(EventKind::Warning { text });
         }
     }

@@ -6,6 +6,7 @@ pub mod filter_worker;
 mod job_worker;
 pub mod lap_counter;
 mod localizer_parameters;
+mod map_watch;
 mod pace;
 mod ros_feed;
 pub mod shadow;

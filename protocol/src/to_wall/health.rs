@@ -164,6 +164,8 @@ pub enum CauseKind {
     RepeatedScans,
     /// The sensors' clock was set, back if negative; its stamps are followed.
     ClockStep,
+    /// On several passes the laser has seen walls elsewhere than the map draws them; over this length.
+    MapDiffers,
 }
 
 impl CauseKind {
@@ -211,6 +213,7 @@ impl CauseKind {
             Self::ScanLag => "scan stamps late against odometry, corrected",
             Self::RepeatedScans => "scans repeat: scanner hangs, for",
             Self::ClockStep => "sensors' clock was set, followed: by",
+            Self::MapDiffers => "the map differs from what the laser sees, over",
         }
     }
 
@@ -228,7 +231,8 @@ impl CauseKind {
             | Self::Innovation
             | Self::OdometryJump
             | Self::PoseFromTwist
-            | Self::RangeMaxWrong => "m",
+            | Self::RangeMaxWrong
+            | Self::MapDiffers => "m",
             Self::YawRate | Self::GyroBias | Self::OdometryTurnBias => "rad/s",
             Self::Creep | Self::WheelsSlide => "m/s",
             Self::AngleIncrementMissing => "rad",

@@ -24,7 +24,7 @@ const RATES: Rates = Rates {
 };
 pub(crate) const ID: CommandId = CommandId(0x0102_0304_0506_0708_090a_0b0c_0d0e_0f10);
 
-pub(crate) const CAUSE_KINDS: [CauseKind; 41] = [
+pub(crate) const CAUSE_KINDS: [CauseKind; 42] = [
     CauseKind::NoInitialPose,
     CauseKind::NewPose,
     CauseKind::Alignment,
@@ -66,6 +66,7 @@ pub(crate) const CAUSE_KINDS: [CauseKind; 41] = [
     CauseKind::ScanLag,
     CauseKind::RepeatedScans,
     CauseKind::ClockStep,
+    CauseKind::MapDiffers,
 ];
 
 pub(crate) const STATES: [State; 7] = [

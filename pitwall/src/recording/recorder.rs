@@ -253,17 +253,18 @@ impl Work {
         let mut schedule = SyncSchedule::new(Instant::now());
         loop {
             match self.queue.recv_timeout(schedule.left(Instant::now())) {
-                Ok(event) => {
-                    self.unsynced.push(event.clone());
-                    self.opening.add(&event);
-                    if let Err(error) = self.recording.write(&event) {
-                        self.move_on(RecordingError::mcap(&self.path, error))?;
-                    }
-                }
+                Ok(event) => self.write(event)?,
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
             if schedule.due(Instant::now()) {
+                // What came during a slow sync is written before the next one. Otherwise one event would follow each.
+                for _ in 0..self.queue.len() {
+                    let Ok(event) = self.queue.try_recv() else {
+                        break;
+                    };
+                    self.write(event)?;
+                }
                 if let Err(error) = self.sync() {
                     self.move_on(error)?;
                 }
@@ -285,6 +286,16 @@ impl Work {
         drop(writer);
         self.sync.sync_all().map_err(|e| RecordingError::io(&path, e))?;
         Ok(summary)
+    }
+
+    fn write(&mut self, event: Arc<FleetEvent>) -> Result<(), RecordingError> {
+        let written = self.recording.write(&event);
+        self.opening.add(&event);
+        self.unsynced.push(event);
+        match written {
+            Ok(()) => Ok(()),
+            Err(error) => self.move_on(RecordingError::mcap(&self.path, error)),
+        }
     }
 
     /// Brings everything to the disk.

@@ -44,13 +44,14 @@ class Bench:
             ip("-n", space, "link", "set", name, "up")
             ip("-n", space, "link", "set", "lo", "up")
             with contextlib.suppress(subprocess.CalledProcessError):
-                ip("netns", "exec", space, "sh", "-c", f"echo cubic > {slow_link.CONGESTION_CONTROL}")
+                ip("netns", "exec", space, "sh", "-c", slow_link.USUAL_CONGESTION_CONTROL)
         self.link(*GOOD)
         self.radio.start()
         self.folder = stack.enter_context(tempfile.TemporaryDirectory())
-        subprocess.run([wall, "keys", "new", "--folder", self.folder, "--pit", "pit", "--car", "car-1"], check=True,
+        subprocess.run([wall, "keys", "new", "--folder", self.folder, "--pit", "pit", "--car", "car-1", "--viewer", "fan"], check=True,
                        capture_output=True)
         self.car = self.wall = self.views = None
+        self.others = []
         stack.callback(self.stop)
 
     def link(self, rate, delay, loss):
@@ -68,26 +69,33 @@ class Bench:
                                "--listen", f"tls/{WALL}:{PORT}", "--listen", f"tls/127.0.0.1:{PORT}", "watch", "--rate", "10")
         self.views = Lines(self.wall)
 
+    def start_other(self, space, keys, address):
+        """Another pit wall or viewer, which joins the first one. Returns its views."""
+        process = self.spawn(space, self.program, "--json", "--keys", f"{self.folder}/{keys}.keys",
+                             "--connect", f"tls/{address}:{PORT}", "watch", "--rate", "10")
+        self.others.append(process)
+        return Lines(process)
+
     def stop(self):
         self.radio.ended = True
-        for process in (self.car, self.wall):
+        for process in (self.car, self.wall, *self.others):
             if process:
                 process.kill()
                 process.wait()
 
-    def cars(self, since, until=None):
+    def cars(self, since, until=None, views=None):
         """Views of the car, with their time, from `since` on."""
-        for when, view in list(self.views.seen):
+        for when, view in list((views or self.views).seen):
             if when >= since and (until is None or when <= until):
                 for car in view:
                     if car["car"] == "car-1":
                         yield when, car
 
-    def first(self, since, condition, patience):
+    def first(self, since, condition, patience, views=None):
         """Time from `since` to the first view that is so; None when there is none in time."""
         deadline = since + patience
         while time.monotonic() < deadline:
-            for when, car in self.cars(since):
+            for when, car in self.cars(since, views=views):
                 if condition(car):
                     return when - since
             time.sleep(0.05)
@@ -174,7 +182,7 @@ def car_killed(bench):
     began = time.monotonic()
     dark = bench.first(began, blind, 5.0)
     bench.start_car()
-    return {"blind": dark, "expect_blind": True, "live": bench.first(began, live, 30.0), "soon": RESTART}
+    return {"blind": dark, "expect_blind": True, "live": bench.first(began + (dark or 0.0) + 0.5, live, 30.0), "soon": RESTART}
 
 
 def both_killed(bench):
@@ -198,6 +206,23 @@ def roaming(bench):
     return {"blind": dark, "expect_blind": False, "live": bench.first(began + (dark or 0.0), live, 30.0), "soon": RESTART}
 
 
+def seen_by_another(bench, space, keys, address, seconds=30):
+    """A cut, as a second pit wall or a viewer sees it."""
+    views = bench.start_other(space, keys, address)
+    if bench.first(time.monotonic(), live, 30.0, views) is None:
+        return {"live": None, "soon": SOON}
+    bench.radio.out = True
+    began = time.monotonic()
+    dark = bench.first(began, blind, SOON + 1, views)
+    time.sleep(max(0.0, began + seconds - time.monotonic()))
+    bench.radio.out = False
+    row = {"blind": dark, "expect_blind": True, "live": bench.first(time.monotonic(), live, 20.0, views), "soon": SOON}
+    process = bench.others.pop()
+    process.kill()
+    process.wait()
+    return row
+
+
 ROWS = [
     ("cut of 1 s", lambda bench: cut(bench, 1)),
     ("cut of 5 s", lambda bench: cut(bench, 5)),
@@ -207,6 +232,8 @@ ROWS = [
     ("20 Mbit/s, 5 ms, 20 % lost", lambda bench: bad(bench, 20e6, 0.005, 0.20)),
     ("bursts: 0.4 s out of 1.6 s nothing", bursts),
     ("car gets another address", roaming),
+    ("second pit wall, cut of 30 s", lambda bench: seen_by_another(bench, bench.wall_side, "pit", "127.0.0.1")),
+    ("viewer beyond the radio, cut of 30 s", lambda bench: seen_by_another(bench, bench.car_side, "fan", WALL)),
     ("pit wall and its router killed", wall_killed),
     ("car killed", car_killed),
     ("both killed", both_killed),

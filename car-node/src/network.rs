@@ -52,7 +52,7 @@ const LONGEST_MESSAGE: usize = 17 * 1024 * 1024;
 /// Send buffer of the operating system [bytes]: enough for 10 Mbit/s at a round trip of 10 ms.
 const SEND_BUFFER: usize = 16 * 1024;
 /// Size of a batch on the link [bytes]: a pose waits for at most one batch of a scan.
-const BATCH: usize = 8 * 1024;
+const BATCH: usize = 4 * 1024;
 
 /// Parses an endpoint of the command line. The error describes the format.
 pub fn endpoint(text: &str) -> Result<String, String> {
@@ -113,19 +113,13 @@ pub fn open(
         ("connect/endpoints", endpoints),
         ("connect/exit_on_failure", "false".to_owned()),
         ("connect/timeout_ms", "-1".to_owned()),
-        (
-            "connect/retry",
-            r#"{"period_init_ms":200,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned(),
-        ),
+        ("connect/retry", sockets::RETRY.to_owned()),
         // Only cars open connections: two peers that connect to each other can stay half connected.
         ("listen/endpoints", "[]".to_owned()),
         ("scouting/multicast/enabled", scout),
         ("scouting/gossip/enabled", "false".to_owned()),
-        // A cut link is noticed within four seconds. Not sooner: on a radio that loses packets TCP is sometimes silent for two,
-        // and connecting again takes longer than waiting.
-        ("transport/link/tx/lease", "4000".to_owned()),
         // On a slow link messages should wait in zenoh's queues, where a pose overtakes a scan, and not in the buffers of the
-        // operating system. Those hold megabytes: a minute of a slow link.
+        // operating system. Those hold megabytes: a minute of a slow link. `sockets` limits what they take further.
         ("transport/link/tcp/so_sndbuf", SEND_BUFFER.to_string()),
         ("transport/link/rx/max_message_size", LONGEST_MESSAGE.to_string()),
         ("transport/link/tx/batch_size", BATCH.to_string()),
@@ -138,7 +132,7 @@ pub fn open(
         ),
     ];
     let mut config = Config::default();
-    for (key, value) in settings {
+    for (key, value) in settings.into_iter().chain(sockets::zenoh_settings()) {
         config
             .insert_json5(key, &value)
             .map_err(|error| NetworkError::Config {
@@ -158,6 +152,7 @@ pub fn open(
             .insert_json5("transport/link/tls/so_sndbuf", &SEND_BUFFER.to_string())
             .map_err(|_| NetworkError::Keys("zenoh refuses the size of its send buffer".into()))?;
     }
+    sockets::watch();
     zenoh::open(config)
         .wait()
         .map_err(|error| NetworkError::Open(error.to_string()))

@@ -44,6 +44,8 @@ const SECOND: i64 = 1_000_000_000;
 impl StreamStatistics {
     /// Number of messages from which the rate is computed.
     const WINDOW: usize = 64;
+    /// Number of messages whose delay is the present one.
+    const NEWEST: usize = 10;
     /// Maximum number of entries in `unproven`.
     const UNPROVEN: usize = 4096;
 
@@ -143,8 +145,8 @@ impl StreamStatistics {
         self.newest
     }
 
-    /// Median delay of the messages in the second before `now` \[unix ns\], by the uncorrected clocks \[s\], and their number.
-    /// None when there were none.
+    /// Median delay of the last messages in the second before `now` \[unix ns\], by the uncorrected clocks \[s\], and the number of
+    /// messages in that second. None when there were none.
     pub fn transit(&self, now: i64) -> Option<(f64, usize)> {
         let mut recent: Vec<f64> = self
             .transits
@@ -152,8 +154,10 @@ impl StreamStatistics {
             .filter(|(at, _)| now - at <= SECOND)
             .map(|(_, late)| *late)
             .collect();
-        recent.sort_by(f64::total_cmp);
-        Some((*recent.get(recent.len() / 2)?, recent.len()))
+        let count = recent.len();
+        let newest = &mut recent[count.saturating_sub(Self::NEWEST)..];
+        newest.sort_by(f64::total_cmp);
+        Some((*newest.get(newest.len() / 2)?, count))
     }
 
     /// When the last message arrived \[unix ns\].

@@ -184,24 +184,24 @@ impl Client {
     ) -> Result<Vec<u8>, Option<String>> {
         let begun = Instant::now();
         let patience = ABSENT_AFTER.min(timeout);
+        // On a slow link, the reply to one copy may come after the next copy was sent.
+        let (sender, mut replies) = mpsc::unbounded_channel();
         let run_id = loop {
             let Ok(request) = encode(&ClockRequest { sent: unix_now() }, stamps()) else {
                 return Err(None);
             };
-            let (sender, mut replies) = mpsc::unbounded_channel();
-            let left = patience.saturating_sub(begun.elapsed()).max(RESEND_AFTER);
+            let left = patience.saturating_sub(begun.elapsed());
             query(
                 &self.session,
                 car,
                 Topic::Clock,
                 request,
                 None,
-                left,
+                left.max(RESEND_AFTER),
                 OPERATOR_PRIORITY,
                 &sender,
             )
             .await;
-            drop(sender);
             let reply = tokio::time::timeout(RESEND_AFTER, replies.recv())
                 .await
                 .ok()
@@ -212,7 +212,6 @@ impl Client {
             if begun.elapsed() >= patience {
                 return Err(None);
             }
-            tokio::time::sleep(Duration::from_millis(50)).await;
         };
         let key = Key::new(car.clone(), command.action.topic()).to_string();
         signer.sign(&key, run_id, bytes).map_err(Some)

@@ -104,13 +104,13 @@ impl Role {
         let mut entries = vec![
             ("scouting/multicast/enabled", self.discoverable().to_string()),
             ("scouting/gossip/enabled", "false".to_owned()),
-            ("transport/link/tx/lease", "4000".to_owned()),
             ("transport/link/rx/max_message_size", LONGEST_MESSAGE.to_string()),
             ("transport/unicast/max_sessions", MOST_SESSIONS.to_string()),
             // Sockets that connect and say nothing keep others out for a moment only.
             ("transport/unicast/accept_timeout", "3000".to_owned()),
             ("transport/unicast/accept_pending", MOST_SESSIONS.to_string()),
         ];
+        entries.extend(sockets::zenoh_settings());
         match self {
             Self::Router { listen, .. } => {
                 entries.push(("mode", r#""router""#.to_owned()));
@@ -120,8 +120,7 @@ impl Role {
                 entries.push(("mode", r#""client""#.to_owned()));
                 entries.push(("connect/endpoints", list(connect)));
                 entries.push(("connect/timeout_ms", "3000".to_owned()));
-                let retry = r#"{"period_init_ms":200,"period_max_ms":1000,"period_increase_factor":2}"#;
-                entries.push(("connect/retry", retry.to_owned()));
+                entries.push(("connect/retry", sockets::RETRY.to_owned()));
             }
         }
         let side = match self {
@@ -131,6 +130,7 @@ impl Role {
         let settings = protection
             .settings(&side)
             .map_err(|error| ConnectionError::Keys(error.to_string()))?;
+        sockets::watch();
         let mut config = Config::default();
         for (key, value) in entries {
             config

@@ -214,6 +214,9 @@ pub(crate) struct Run {
     /// Size of one file of a recording.
     #[arg(long, value_name = "SIZE", default_value_t = Size(RecordOptions::SPLIT), value_parser = size)]
     pub(crate) record_split: Size,
+    /// Most memory for the range tables of the map. Where they would take more, they are coarser or replaced, which is said at start.
+    #[arg(long, value_name = "SIZE", default_value_t = Size(synpf::TABLE_BUDGET as u64), value_parser = size)]
+    pub(crate) table_memory: Size,
     /// Seed of the filter's and the simulator's random numbers.
     #[arg(long, value_name = "N", default_value_t = 0, allow_negative_numbers = true, value_parser = seed)]
     pub(crate) seed: u64,

@@ -24,7 +24,7 @@ use simulator::{CarSetup, Grip, OdometryParams, YawSource};
 use synpf::{TablePolicy, TrackMap};
 
 use super::health::Heartbeat;
-use crate::cli::{Odometry, Run, SourceKind};
+use crate::cli::{Odometry, Run, Size, SourceKind};
 
 /// Time after the last message of a bag for the pit wall to recover gaps.
 const LINGER: Duration = Duration::from_secs(1);
@@ -75,6 +75,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
                 track.name.clone(),
                 track.grid.clone(),
                 Some(track.raceline.clone()),
+                arguments.table_memory,
             )
             .with_context(|| arguments.map.display().to_string())?;
             let race = Race::new(track, vec![setup(arguments.odometry)], arguments.seed, Vec::new());
@@ -119,7 +120,13 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
         arguments.connect.join(", ")
     };
     eprintln!("{car}: {description}; connects to {wall}. Ctrl-C ends it.");
-    let reason = wait(&node, &signal, arguments.stay, Heartbeat::new(state.as_deref()));
+    let reason = wait(
+        &car,
+        &node,
+        &signal,
+        arguments.stay,
+        Heartbeat::new(state.as_deref()),
+    );
     let estimate = node.shared().latest_pose();
     node.shutdown(reason);
     match estimate {
@@ -253,9 +260,18 @@ fn ros_services(connection: &RosConnection, ros_node: &RosNode, node: &Node) -> 
 }
 
 /// Waits for the end of the node, and returns the reason.
-fn wait(node: &Node, signal: &Receiver<&'static str>, stay: bool, mut heartbeat: Heartbeat) -> &'static str {
+fn wait(
+    car: &CarName,
+    node: &Node,
+    signal: &Receiver<&'static str>,
+    stay: bool,
+    mut heartbeat: Heartbeat,
+) -> &'static str {
     let mut ended = None;
     loop {
+        for refusal in keys::refusals::take() {
+            eprintln!("{car}: {refusal}");
+        }
         match signal.recv_timeout(Duration::from_millis(50)) {
             Ok(reason) => return reason,
             Err(RecvTimeoutError::Disconnected) => return "the signal handler ended",
@@ -309,13 +325,22 @@ fn map_file(arguments: &Run) -> anyhow::Result<RaceMap> {
         Some(folder) if stem == "map" => folder.to_string_lossy(),
         _ => stem,
     };
-    race_map(name.into_owned(), grid, raceline).with_context(|| arguments.map.display().to_string())
+    race_map(name.into_owned(), grid, raceline, arguments.table_memory)
+        .with_context(|| arguments.map.display().to_string())
 }
 
-fn race_map(name: String, grid: OccupancyGrid, raceline: Option<Raceline>) -> anyhow::Result<RaceMap> {
+fn race_map(
+    name: String,
+    grid: OccupancyGrid,
+    raceline: Option<Raceline>,
+    table_memory: Size,
+) -> anyhow::Result<RaceMap> {
+    let map = TrackMap::new(grid)?
+        .with_table_policy(TablePolicy::Defer)
+        .with_table_budget(table_memory.0 as usize);
     Ok(RaceMap {
         name,
-        map: Arc::new(TrackMap::new(grid)?.with_table_policy(TablePolicy::Defer)),
+        map: Arc::new(map),
         raceline: raceline.map(Arc::new),
     })
 }

@@ -10,8 +10,9 @@ use pose_graph::{FrozenMap, PoseGraph, PoseGraphParameters, PoseGraphTuning};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use synpf::{
-    Localizer, ParameterFault, ParameterValues, Parameters, PreparedParameters, Reference,
-    ReferenceParameters, ReferenceTuning, SetUpError, SynPf, TrackMap, Tuning, parameter_table,
+    Localizer, ParameterFault, ParameterValues, Parameters, PreparedParameters, RangeMethod, Reference,
+    ReferenceParameters, ReferenceTuning, SensorModelKind, SetUpError, SynPf, TrackMap, Tuning,
+    parameter_table,
 };
 
 use super::external::{External, ExternalParameters};
@@ -193,6 +194,19 @@ impl LocalizerParameters {
             Self::Reference(parameters) => Reference::prepare(map, map_from_base_link, parameters),
             // They cast few rays, or none.
             Self::External(_) | Self::PoseGraph(_) => {}
+        }
+    }
+
+    /// A sentence on what the limit of memory has changed in the range tables of this set; None where nothing.
+    pub fn table_note(&self, map: &TrackMap) -> Option<String> {
+        match self {
+            Self::SynPf(parameters)
+                if parameters.sensor.sensor_model == SensorModelKind::Beam
+                    && parameters.sensor.range_method == RangeMethod::Lut =>
+            {
+                map.table_note()
+            }
+            _ => None,
         }
     }
 

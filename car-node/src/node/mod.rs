@@ -232,6 +232,7 @@ impl Node {
             Start::Truth => source.start(),
             Start::Global => None,
         };
+        let table_note = set.parameters.table_note(&map.map);
         set.parameters.prepare_tables(&map.map, known);
         let starts_with_a_pose = start_at(localizer.as_mut(), start, source.start())?;
 
@@ -306,7 +307,13 @@ impl Node {
             None,
             None,
         );
-        if let Some(text) = exposure(&connect, &protection, search) {
+        if let Some(text) = &table_note {
+            tracing::warn!("{text}");
+        }
+        for text in exposure(&connect, &protection, search)
+            .into_iter()
+            .chain(table_note)
+        {
             shared.event(clock.now(), 0, EventKind::Warning { text }, None, None);
         }
         let publisher = publisher.start(publisher_stops)?;

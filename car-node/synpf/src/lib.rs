@@ -115,5 +115,5 @@ pub use synpf::SynPf;
 #[doc(hidden)]
 pub use synpf::stages::Stage;
 pub use table_store::{TableJob, TablePolicy};
-pub use track_map::TrackMap;
+pub use track_map::{TABLE_BUDGET, TrackMap};
 pub use tuning::Tuning;

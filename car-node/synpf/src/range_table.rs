@@ -6,8 +6,10 @@ use wide::{f32x8, i32x8};
 
 use crate::cddt::{CddtSlice, DIRECTIONS, HALF_TURN};
 
-/// Directions that one task fills while the table is built.
+/// Directions that are filled at once while the table is built: their crossings with walls are in memory together.
 const SEGMENT: usize = 16;
+/// Rows that one task fills, direction by direction.
+const CHUNK: usize = 1024;
 
 /// One unit of a stored range \[m\]; 16 bits reach 164 m.
 pub(crate) const UNIT: f32 = 0.0025;
@@ -22,80 +24,144 @@ pub(crate) struct TableParameters {
 /// A range table for one region.
 #[derive(Debug)]
 pub(crate) struct RangeTable {
-    /// For each cell of the grid its row in `ranges`; [`NO_ROW`] for cells outside the region, and once more at the
+    /// For each block of cells its row in `ranges`; [`NO_ROW`] for blocks outside the region, and once more at the
     /// end for what is outside the grid.
     row_of: Vec<u32>,
     /// Rows of [`DIRECTIONS`] ranges, the first along x, in units of [`UNIT`].
     ranges: Vec<u16>,
+    /// Blocks along x and y.
     width: usize,
     height: usize,
+    /// One over the cells along a block's side.
+    blocks_per_cell: f32,
+}
+
+/// The blocks of a grid: squares of `side` x `side` cells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Blocks {
+    /// Cells along a side.
+    pub(crate) side: usize,
+    /// Cells along x.
+    grid_width: usize,
+    /// Blocks along x and y.
+    width: usize,
+    height: usize,
+}
+
+impl Blocks {
+    pub(crate) fn new(grid: &OccupancyGrid, side: usize) -> Self {
+        Self {
+            side,
+            grid_width: grid.width,
+            width: grid.width.div_ceil(side),
+            height: grid.height.div_ceil(side),
+        }
+    }
+
+    fn count(self) -> usize {
+        self.width * self.height
+    }
+
+    /// The block of a cell.
+    fn of(self, cell: u32) -> usize {
+        let (column, line) = (cell as usize % self.grid_width, cell as usize / self.grid_width);
+        line / self.side * self.width + column / self.side
+    }
+
+    /// The number of blocks that hold one of the cells.
+    fn filled(self, cells: &[u32]) -> usize {
+        if self.side == 1 {
+            return cells.len();
+        }
+        let mut filled = vec![false; self.count()];
+        for cell in cells {
+            filled[self.of(*cell)] = true;
+        }
+        filled.into_iter().filter(|filled| *filled).count()
+    }
+
+    /// For each block that holds one of the cells, in order: its index, and the cell nearest to its middle of those that lie before
+    /// a wall's face.
+    fn representatives(self, cells: &[u32], field: &DistanceField) -> Vec<(usize, Option<u32>)> {
+        let mut nearest = vec![(f32::INFINITY, None); self.count()];
+        let middle = (self.side as f32 - 1.0) / 2.0;
+        let mut filled = vec![false; self.count()];
+        for &cell in cells {
+            let block = self.of(cell);
+            filled[block] = true;
+            if field.values()[cell as usize] <= 0.0 {
+                continue;
+            }
+            let (column, line) = (cell as usize % self.grid_width, cell as usize / self.grid_width);
+            let aside = [column, line].map(|at| (at % self.side) as f32 - middle);
+            let distance = aside[0].hypot(aside[1]);
+            if distance < nearest[block].0 {
+                nearest[block] = (distance, Some(cell));
+            }
+        }
+        let blocks = filled.into_iter().enumerate().filter(|(_, filled)| *filled);
+        blocks.map(|(block, _)| (block, nearest[block].1)).collect()
+    }
 }
 
 const NO_ROW: u32 = u32::MAX;
 
 impl RangeTable {
+    /// A table for the region of `cells`, with a row for each block of `side` x `side` cells.
     pub(crate) fn new(
         grid: &OccupancyGrid,
         field: &DistanceField,
         cells: &[u32],
+        side: usize,
         parameters: TableParameters,
     ) -> Self {
-        let mut row_of = vec![NO_ROW; grid.cells.len() + 1];
-        for (row, &cell) in cells.iter().enumerate() {
-            row_of[cell as usize] = row as u32;
+        let blocks = Blocks::new(grid, side);
+        let representatives = blocks.representatives(cells, field);
+        let mut row_of = vec![NO_ROW; blocks.count() + 1];
+        for (row, (block, _)) in representatives.iter().enumerate() {
+            row_of[*block] = row as u32;
         }
         let scale = grid.resolution as f32 / UNIT;
         let stored = |range: f32| (range * scale + 0.5) as u16;
         let faces = field.contour();
         // A free cell may lie behind a face where the map is grey. No laser is there: its ranges stay 0.
-        let centres: Vec<(usize, [f32; 2])> = cells
-            .iter()
-            .enumerate()
-            .filter(|(_, cell)| field.values()[**cell as usize] > 0.0)
-            .map(|(row, &cell)| {
-                let (column, line) = (cell as usize % grid.width, cell as usize / grid.width);
-                (row, [column as f32 + 0.5, line as f32 + 0.5])
-            })
-            .collect();
-        // Each task fills a segment of directions, and the same half a turn on, in its own buffers.
-        let segments: Vec<Vec<[[u16; SEGMENT]; 2]>> = (0..HALF_TURN / SEGMENT)
-            .into_par_iter()
-            .map(|segment| {
-                let mut part = vec![[[0; SEGMENT]; 2]; cells.len()];
-                let fill = |part: &mut [[[u16; SEGMENT]; 2]], k: usize| {
-                    let direction = (segment * SEGMENT + k) as f64 / DIRECTIONS as f64;
-                    let steps = f64::from(parameters.directions);
-                    let slice = CddtSlice::new(
-                        &faces,
-                        (direction * steps).round() / steps * std::f64::consts::TAU,
-                    );
-                    for &(row, centre) in &centres {
-                        let [ahead, behind] = slice.ranges(centre);
-                        part[row][0][k] = stored(ahead);
-                        part[row][1][k] = stored(behind);
+        let centre = |cell: u32| {
+            let (column, line) = (cell as usize % grid.width, cell as usize / grid.width);
+            [column as f32 + 0.5, line as f32 + 0.5]
+        };
+        let mut ranges = vec![0u16; representatives.len() * DIRECTIONS];
+        for segment in (0..HALF_TURN).step_by(SEGMENT) {
+            let slice = |k: usize| {
+                let direction = (segment + k) as f64 / DIRECTIONS as f64;
+                let steps = f64::from(parameters.directions);
+                CddtSlice::new(
+                    &faces,
+                    (direction * steps).round() / steps * std::f64::consts::TAU,
+                )
+            };
+            let slices: Vec<_> = (0..SEGMENT).into_par_iter().map(slice).collect();
+            ranges
+                .par_chunks_mut(CHUNK * DIRECTIONS)
+                .zip(representatives.par_chunks(CHUNK))
+                .for_each(|(rows, representatives)| {
+                    for (k, slice) in slices.iter().enumerate() {
+                        for (row, (_, cell)) in rows.chunks_exact_mut(DIRECTIONS).zip(representatives) {
+                            if let Some(cell) = cell {
+                                // The same half a turn on.
+                                let [ahead, behind] = slice.ranges(centre(*cell));
+                                row[segment + k] = stored(ahead);
+                                row[segment + k + HALF_TURN] = stored(behind);
+                            }
+                        }
                     }
-                };
-                (0..SEGMENT).for_each(|k| fill(&mut part, k));
-                part
-            })
-            .collect();
-        let mut ranges = vec![0u16; cells.len() * DIRECTIONS];
-        ranges
-            .par_chunks_mut(DIRECTIONS)
-            .enumerate()
-            .for_each(|(row, out)| {
-                for (segment, part) in segments.iter().enumerate() {
-                    for (half, values) in part[row].iter().enumerate() {
-                        let from = half * HALF_TURN + segment * SEGMENT;
-                        out[from..from + SEGMENT].copy_from_slice(values);
-                    }
-                }
-            });
+                });
+        }
         Self {
             row_of,
             ranges,
-            width: grid.width,
-            height: grid.height,
+            width: blocks.width,
+            height: blocks.height,
+            blocks_per_cell: 1.0 / side as f32,
         }
     }
 
@@ -104,15 +170,18 @@ impl RangeTable {
         size_of_val(&*self.ranges) + size_of_val(&*self.row_of)
     }
 
-    /// Memory that a table for `region_cells` cells of a grid of `grid_cells` takes \[bytes\].
-    pub(crate) fn bytes_for(grid_cells: usize, region_cells: usize) -> usize {
-        region_cells * DIRECTIONS * size_of::<u16>() + (grid_cells + 1) * size_of::<u32>()
+    /// Memory that a table with blocks of `side` x `side` cells takes for a region \[bytes\].
+    pub(crate) fn bytes_for(grid: &OccupancyGrid, cells: &[u32], side: usize) -> usize {
+        let blocks = Blocks::new(grid, side);
+        blocks.filled(cells) * DIRECTIONS * size_of::<u16>() + (blocks.count() + 1) * size_of::<u32>()
     }
 
     /// The rows for eight points in grid coordinates \[cells\]; see [`RangeTable::row`].
     #[inline]
     pub(crate) fn rows_at(&self, u: f32x8, v: f32x8) -> [u32; 8] {
         let zero = f32x8::ZERO;
+        let scale = f32x8::splat(self.blocks_per_cell);
+        let (u, v) = (u * scale, v * scale);
         // False for NaN.
         let inside = u.simd_ge(zero)
             & v.simd_ge(zero)

@@ -13,6 +13,7 @@
 //! | ray marching | 1/4 | interpolation of the field between the cells' centres, with steps of at least a quarter of a cell |
 //! | casting on the grid (`maps::OccupancyGrid::cast`) | 1/2 | it ends at the edges of occupied cells, not at faces |
 //!
+//! A table with blocks of n x n cells adds up to 1.42 (n - 1): the range is for the cell nearest to the middle of the block.
 //! A set with fewer directions in the table (`theta_discretization`) adds r * pi / directions.
 
 use std::sync::Arc;
@@ -209,13 +210,13 @@ mod tests {
 
     #[test]
     fn a_range_table_is_right_to_its_cell_its_directions_and_its_steps() {
-        for (seed, directions) in [(2, 256), (3, 100)] {
+        for (seed, directions, side) in [(2, 256, 1), (3, 100, 1), (6, 256, 3)] {
             let parameters = TableParameters { directions };
             let build = |room: &Room| {
                 let free = |i: &u32| room.grid.cells[*i as usize] == Cell::Free;
                 let cells: Vec<u32> = (0..(SIDE * SIDE) as u32).filter(free).collect();
-                let table = RangeTable::new(&room.grid, &room.field, &cells, parameters);
-                assert_eq!(table.bytes(), RangeTable::bytes_for(SIDE * SIDE, cells.len()));
+                let table = RangeTable::new(&room.grid, &room.field, &cells, side, parameters);
+                assert_eq!(table.bytes(), RangeTable::bytes_for(&room.grid, &cells, side));
                 table
             };
             let mut random = SmallRng::seed_from_u64(seed);
@@ -229,7 +230,9 @@ mod tests {
                 } else {
                     PI / f32::from(directions)
                 };
-                let aside = 0.5f32.sqrt() + range * (PI / 128.0 + coarse) + 0.5 * UNIT / RESOLUTION as f32;
+                let block = 2f32.sqrt() * (side as f32 - 1.0);
+                let aside =
+                    block + 0.5f32.sqrt() + range * (PI / 128.0 + coarse) + 0.5 * UNIT / RESOLUTION as f32;
                 (angle, range, CDDT.map(|bound| bound + aside))
             });
         }

@@ -15,6 +15,7 @@ use crate::particles::Particles;
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::ranges::Ranges;
 use crate::sensor_parameters::{RangeMethod, SensorModelKind};
+use crate::track_map::TableLayout;
 
 /// A sensor model with its tables of likelihoods; built once per parameter set, outside the filter's thread.
 #[derive(Debug, Clone)]
@@ -45,12 +46,17 @@ impl SensorModel {
             return Ranges::RayMarching;
         };
         let table = parameters.sensor.table_parameters();
-        match (method, region) {
-            (RangeMethod::Lut, Some(region)) => map
+        let layout = match (method, region) {
+            (RangeMethod::Lut, Some(region)) => map.layout(region),
+            (RangeMethod::Cddt, _) => TableLayout::Cddt,
+            (RangeMethod::Lut | RangeMethod::RayMarching, _) => TableLayout::RayMarching,
+        };
+        match (layout, region) {
+            (TableLayout::Table { .. }, Some(region)) => map
                 .range_table(region, table)
                 .map_or(Ranges::Interim, Ranges::Table),
-            (RangeMethod::Cddt, _) => map.cddt().map_or(Ranges::Interim, Ranges::Cddt),
-            (RangeMethod::Lut | RangeMethod::RayMarching, _) => Ranges::RayMarching,
+            (TableLayout::Cddt, _) => map.cddt().map_or(Ranges::Interim, Ranges::Cddt),
+            (TableLayout::Table { .. } | TableLayout::RayMarching, _) => Ranges::RayMarching,
         }
     }
 

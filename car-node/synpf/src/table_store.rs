@@ -51,26 +51,41 @@ impl Table {
 }
 
 /// The tables of one map. No lock is held while a table is built.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct TableStore {
     policy: TablePolicy,
+    /// Memory that all tables may take \[bytes\]; the oldest make room.
+    budget: usize,
     state: Mutex<State>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     built: HashMap<TableKey, Table>,
+    /// The keys of `built`, the oldest first.
+    order: Vec<TableKey>,
     /// Tables that were asked for and are not built, in the order of asking.
     pending: Vec<TableKey>,
 }
 
 impl TableStore {
     /// An empty store.
-    pub(crate) fn new(policy: TablePolicy) -> Self {
+    pub(crate) fn new(policy: TablePolicy, budget: usize) -> Self {
         Self {
             policy,
+            budget,
             state: Mutex::default(),
         }
+    }
+
+    /// The policy.
+    pub(crate) fn policy(&self) -> TablePolicy {
+        self.policy
+    }
+
+    /// Memory that all tables may take \[bytes\].
+    pub(crate) fn budget(&self) -> usize {
+        self.budget
     }
 
     /// A table if it is there. Else, by the policy, it is built now or put on the list of pending ones.
@@ -96,7 +111,17 @@ impl TableStore {
         let table = build();
         let mut state = self.state();
         state.pending.retain(|pending| *pending != key);
-        state.built.entry(key).or_insert(table).clone()
+        if let Some(table) = state.built.get(&key) {
+            return table.clone();
+        }
+        state.built.insert(key, table.clone());
+        state.order.push(key);
+        // Who uses an old one keeps it.
+        while state.order.len() > 1 && state.built.values().map(Table::bytes).sum::<usize>() > self.budget {
+            let oldest = state.order.remove(0);
+            state.built.remove(&oldest);
+        }
+        table
     }
 
     /// The tables that localizers wait for, the oldest first.

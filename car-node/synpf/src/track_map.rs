@@ -28,9 +28,28 @@ pub struct TrackMap {
     /// For each cell the index of its region; [`NOWHERE`] where it is not free.
     region_of: Vec<u16>,
     tables: TableStore,
+    /// How ranges are predicted in each region, within the budget.
+    layouts: OnceLock<Vec<TableLayout>>,
     score_pyramid: OnceLock<ScorePyramid>,
     reference_tables: RangeTables,
 }
+
+/// What predicts the ranges in a region where a set asks for a range table.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum TableLayout {
+    /// A range table with a row for each block of so many cells along a side.
+    Table { side: usize },
+    /// The CDDT of the whole map.
+    Cddt,
+    /// No table at all.
+    RayMarching,
+}
+
+/// Memory that the range tables of a map take at most \[bytes\].
+pub const TABLE_BUDGET: usize = 200_000_000;
+
+/// A block of cells in a range table is no larger than a cell of a usual map \[m\].
+const LARGEST_BLOCK: f64 = 0.051;
 
 /// A track is nowhere wider than twice this; what is wider lies beside it \[m\].
 const TRACK_CLEARANCE: f64 = 5.0;
@@ -60,7 +79,8 @@ impl TrackMap {
             grid_from_map,
             regions,
             region_of,
-            tables: TableStore::default(),
+            tables: TableStore::new(TablePolicy::default(), TABLE_BUDGET),
+            layouts: OnceLock::new(),
             score_pyramid: OnceLock::new(),
             reference_tables: RangeTables::default(),
         })
@@ -121,9 +141,88 @@ impl TrackMap {
     #[must_use]
     pub fn with_table_policy(self, policy: TablePolicy) -> Self {
         Self {
-            tables: TableStore::new(policy),
+            tables: TableStore::new(policy, self.tables.budget()),
             ..self
         }
+    }
+
+    /// The same map with another limit of the memory that range tables take \[bytes\], [`TABLE_BUDGET`] by default, and without those that
+    /// were built. Where a table would take more, it has coarser cells, or the CDDT takes its place; see [`TrackMap::table_note`].
+    #[must_use]
+    pub fn with_table_budget(self, bytes: usize) -> Self {
+        Self {
+            tables: TableStore::new(self.tables.policy(), bytes),
+            layouts: OnceLock::new(),
+            ..self
+        }
+    }
+
+    /// Memory that all range tables may take \[bytes\].
+    pub(crate) fn table_budget(&self) -> usize {
+        self.tables.budget()
+    }
+
+    /// What predicts the ranges in a region where a set asks for a range table. The regions that may hold the car share the budget.
+    pub(crate) fn layout(&self, region: usize) -> TableLayout {
+        let layouts = self.layouts.get_or_init(|| {
+            let largest = ((LARGEST_BLOCK / self.grid.resolution) as usize).max(1);
+            let budget = self.tables.budget();
+            let bytes = |side: usize, regions: &[usize]| -> usize {
+                let cells = regions.iter().map(|i| &self.regions[*i].cells);
+                cells
+                    .map(|cells| RangeTable::bytes_for(&self.grid, cells, side))
+                    .sum()
+            };
+            let fits = |regions: &[usize]| (1..=largest).find(|side| bytes(*side, regions) <= budget);
+            let plausible = self.plausible_regions();
+            let shared = fits(&plausible);
+            let cddt = OnceLock::new();
+            let without = || {
+                let fits = *cddt.get_or_init(|| Cddt::bytes_at_most(&self.field) <= budget);
+                if fits {
+                    TableLayout::Cddt
+                } else {
+                    TableLayout::RayMarching
+                }
+            };
+            let layout = |region: usize| {
+                let side = if plausible.contains(&region) {
+                    shared
+                } else {
+                    fits(&[region])
+                };
+                side.map_or_else(without, |side| TableLayout::Table { side })
+            };
+            (0..self.regions.len()).map(layout).collect()
+        });
+        layouts[region]
+    }
+
+    /// A sentence on what the budget for range tables has changed, for the log; None where full tables fit.
+    pub fn table_note(&self) -> Option<String> {
+        let plausible = self.plausible_regions();
+        let worst = plausible
+            .iter()
+            .map(|region| self.layout(*region))
+            .find(|layout| *layout != TableLayout::Table { side: 1 })?;
+        let cells = plausible.iter().map(|region| &self.regions[*region].cells);
+        let full: usize = cells
+            .map(|cells| RangeTable::bytes_for(&self.grid, cells, 1))
+            .sum();
+        let instead = match worst {
+            TableLayout::Table { side } => format!(
+                "have cells of {:.1} cm in place of {:.1} cm",
+                1e2 * side as f64 * self.grid.resolution,
+                1e2 * self.grid.resolution
+            ),
+            TableLayout::Cddt => "are replaced by a CDDT, which is slower".to_owned(),
+            TableLayout::RayMarching => "are replaced by ray marching, which is much slower".to_owned(),
+        };
+        Some(format!(
+            "full range tables of this map take {} MB; with a limit of {} MB they {instead}",
+            full.div_ceil(1_000_000),
+            self.tables.budget() / 1_000_000
+        ))
     }
 
     /// The tables that localizers wait for, the oldest first; always empty with [`TablePolicy::BuildNow`].
@@ -151,7 +250,7 @@ impl TrackMap {
     pub(crate) fn bytes_for(&self, key: TableKey) -> usize {
         match key {
             TableKey::Ranges { region, .. } => {
-                RangeTable::bytes_for(self.grid.cells.len(), self.regions[region].cells.len())
+                RangeTable::bytes_for(&self.grid, &self.regions[region].cells, self.side(region))
             }
             TableKey::Cddt => Cddt::bytes_at_most(&self.field),
         }
@@ -179,12 +278,21 @@ impl TrackMap {
         }
     }
 
+    fn side(&self, region: usize) -> usize {
+        match self.layout(region) {
+            TableLayout::Table { side } => side,
+            // Never asked for.
+            TableLayout::Cddt | TableLayout::RayMarching => 1,
+        }
+    }
+
     fn new_table(&self, key: TableKey) -> Table {
         match key {
             TableKey::Ranges { region, parameters } => Table::Ranges(Arc::new(RangeTable::new(
                 &self.grid,
                 &self.field,
                 &self.regions[region].cells,
+                self.side(region),
                 parameters,
             ))),
             TableKey::Cddt => Table::Cddt(Arc::new(Cddt::new(&self.field))),
@@ -261,6 +369,7 @@ pub(crate) mod tests {
 
     use super::*;
     use crate::Parameters;
+    use crate::ranges::Ranges;
 
     /// A room of 5 x 5 m.
     pub(crate) fn room() -> TrackMap {
@@ -294,6 +403,52 @@ pub(crate) mod tests {
         assert!(map.range_table(0, parameters).is_some());
         assert!(map.cddt().is_some());
         assert_eq!(map.pending_tables(), []);
+    }
+
+    /// Cells of 5 mm used to make 730 MB.
+    #[test]
+    fn tables_stay_within_the_budget_whatever_the_cells_size() {
+        let set = Parameters::default();
+        let room = |resolution: f64| {
+            let grid = OccupancyGrid::from_fn(250, 250, resolution, Pose::IDENTITY, |column, row| {
+                match (column, row) {
+                    (0 | 249, _) | (_, 0 | 249) => Cell::Occupied,
+                    _ => Cell::Free,
+                }
+            });
+            TrackMap::new(grid).expect("free space")
+        };
+        let ranges = |map: &TrackMap| {
+            let sensor = crate::sensor_model::SensorModel::new(&set);
+            sensor.ranges(map, Some(0), &set)
+        };
+        for (resolution, budget, expected) in [
+            (0.01, TABLE_BUDGET, TableLayout::Table { side: 1 }),
+            (0.01, 9_000_000, TableLayout::Table { side: 2 }),
+            (0.01, 1_600_000, TableLayout::Table { side: 5 }),
+            (0.06, TABLE_BUDGET, TableLayout::Table { side: 1 }),
+            (0.06, 12_000_000, TableLayout::Cddt),
+            (0.06, 1_000, TableLayout::RayMarching),
+        ] {
+            let map = room(resolution).with_table_budget(budget);
+            assert_eq!(map.layout(0), expected, "{budget}");
+            assert_eq!(map.table_note().is_none(), budget == TABLE_BUDGET, "{budget}");
+            assert!(map.table_bytes_for(None, &set) <= budget, "{budget}");
+            map.prepare(None, &set);
+            assert!(map.table_bytes() <= budget, "{} of {budget}", map.table_bytes());
+            let found = match ranges(&map) {
+                Ranges::Table(_) => TableLayout::Table { side: map.side(0) },
+                Ranges::Cddt(_) => TableLayout::Cddt,
+                Ranges::RayMarching | Ranges::Interim => TableLayout::RayMarching,
+            };
+            assert_eq!(found, expected, "{budget}");
+        }
+        // Another set needs a table of its own: the first one makes room.
+        let map = room(0.01).with_table_budget(33_000_000);
+        for directions in [256, 200, 100] {
+            map.range_table(0, TableParameters { directions });
+            assert!(map.table_bytes() <= 33_000_000);
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::parameters::Parameters;
 use crate::sensor_model::SensorModel;
 use crate::sensor_parameters::{RangeMethod, SensorModelKind};
 use crate::table_store::{TableJob, TableKey};
-use crate::track_map::TrackMap;
+use crate::track_map::{TableLayout, TrackMap};
 
 /// A parameter set with the tables that it needs. Making one takes milliseconds, swapping it in takes none.
 #[derive(Debug, Clone)]
@@ -68,8 +68,15 @@ impl TrackMap {
                 let regions =
                     at.map_or_else(|| self.plausible_regions(), |region| region.into_iter().collect());
                 let parameters = parameters.sensor.table_parameters();
-                let key = |region| TableKey::Ranges { region, parameters };
-                regions.into_iter().map(key).collect()
+                let key = |region| match self.layout(region) {
+                    TableLayout::Table { .. } => Some(TableKey::Ranges { region, parameters }),
+                    TableLayout::Cddt => Some(TableKey::Cddt),
+                    TableLayout::RayMarching => None,
+                };
+                let mut keys: Vec<_> = regions.into_iter().filter_map(key).collect();
+                // One CDDT serves all regions.
+                keys.dedup();
+                keys
             }
             RangeMethod::Cddt => vec![TableKey::Cddt],
             RangeMethod::RayMarching => Vec::new(),

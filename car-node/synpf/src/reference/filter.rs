@@ -131,7 +131,8 @@ impl Reference {
     }
 
     /// Builds the range table for the region around a pose in `map`, or, without one, for all that look like tracks, if it
-    /// is not there yet. Where there is no table, the localizer casts rays, which gives the same ranges and takes longer.
+    /// is not there yet and the map's limit of memory allows it. Where there is no table, the localizer casts rays, which gives the same ranges
+    /// and takes longer.
     pub fn prepare(map: &TrackMap, map_from_base_link: Option<Pose>, parameters: &ReferenceParameters) {
         let method = Method::new(parameters, map.grid().resolution);
         let regions = match map_from_base_link {
@@ -140,7 +141,8 @@ impl Reference {
         };
         for region in regions {
             let cells = &map.regions()[region].cells;
-            map.reference_tables().build(map.grid(), region, cells, method);
+            map.reference_tables()
+                .build(map.grid(), region, cells, method, map.table_budget());
         }
     }
 

@@ -211,9 +211,18 @@ impl RangeTables {
         Arc::clone(self.walls.get_or_init(|| Arc::new(Walls::new(grid))))
     }
 
-    /// Builds the table for a region, away from the filter's thread.
-    pub(super) fn build(&self, grid: &OccupancyGrid, region: usize, cells: &[u32], method: Method) {
-        if self.get(region, method).is_some() {
+    /// Builds the table for a region, away from the filter's thread, unless all tables then took more than `budget` \[bytes\].
+    pub(super) fn build(
+        &self,
+        grid: &OccupancyGrid,
+        region: usize,
+        cells: &[u32],
+        method: Method,
+        budget: usize,
+    ) {
+        let bytes = cells.len() * usize::from(method.directions) * size_of::<u16>()
+            + grid.cells.len() * size_of::<u32>();
+        if self.get(region, method).is_some() || self.bytes() + bytes > budget {
             return;
         }
         let table = Arc::new(Table::new(grid, &self.walls(grid), cells, method));
@@ -311,7 +320,7 @@ mod tests {
             .filter(|&i| grid.cells[i as usize] == Cell::Free)
             .collect();
         assert!(tables.get(0, method(true)).is_none());
-        tables.build(&grid, 0, &cells, method(true));
+        tables.build(&grid, 0, &cells, method(true), usize::MAX);
         let table = tables.get(0, method(true)).expect("built");
         let walls = tables.walls(&grid);
         for cell in [20 + 10 * 60, 43 + 20 * 60] {

@@ -7,20 +7,26 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use cli::{Cli, Command};
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
 fn main() -> ExitCode {
     // zenoh warns of what is meant to be so; what concerns the driver we say ourselves.
-    let filter =
-        EnvFilter::try_from_default_env().unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off".into());
+    let filter = EnvFilter::try_from_default_env()
+        .unwrap_or_else(|_| "warn,zenoh=off,zenoh_transport=off,zenoh_link_tls=off".into());
     // At debug level zenoh prints its configuration, and with it the password.
     let filter = match "zenoh::api::session=off".parse() {
         Ok(quiet) => filter.add_directive(quiet),
         Err(_) => filter,
     };
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
+    tracing_subscriber::registry()
+        .with(
+            tracing_subscriber::fmt::layer()
+                .with_writer(std::io::stderr)
+                .with_filter(filter),
+        )
+        .with(keys::refusals::watch())
         .init();
     let result = match Cli::parse().command {
         Command::Run(arguments) => commands::run::run(&arguments).map(|()| ExitCode::SUCCESS),

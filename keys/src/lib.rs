@@ -39,6 +39,7 @@ mod identity;
 mod passphrase;
 mod private_file;
 mod protection;
+pub mod refusals;
 mod signature;
 mod token;
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::Receiver;
 use keys::Protection;
-use protocol::{CarName, Severity};
+use protocol::{CarName, LinkReport, Severity};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
@@ -43,6 +43,10 @@ impl FleetService {
     const TICK: Duration = Duration::from_millis(100);
     /// Period of the link reports to the cars.
     const REPORT_LINKS: Duration = Duration::from_secs(1);
+    /// Their period for a car whose poses are late, so that it sends less before much waits on its link.
+    const REPORT_LATE: Duration = Duration::from_millis(250);
+    /// Poses that arrive later than this are late \[s\].
+    const LATE: f32 = 0.2;
     /// Period of the clock comparisons.
     const COMPARE_CLOCKS: Duration = Duration::from_secs(2);
     /// The final sync of a recording ends when nothing has arrived for this long.
@@ -355,6 +359,20 @@ impl FleetService {
         }
         self.connection.close().await;
     }
+
+    /// Sends the cars their link reports that are `wanted`.
+    async fn report_links(&self, wanted: impl Fn(&LinkReport) -> bool) {
+        let now = unix_now();
+        let reports: Vec<_> = self
+            .fleet()
+            .cars()
+            .filter_map(|car| Some((car.name.clone(), car.link_report(now)?)))
+            .filter(|(_, report)| wanted(report))
+            .collect();
+        for (car, report) in reports {
+            self.client().report(&car, &report).await;
+        }
+    }
 }
 
 /// Ticks the fleet, reports links to the cars, compares clocks, and fetches maps and info.
@@ -362,6 +380,7 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
     let mut ticks = tokio::time::interval(FleetService::TICK);
     let mut compared: Option<Instant> = None;
     let mut reported: Option<Instant> = None;
+    let mut reported_late: Option<Instant> = None;
     let mut clock_step = stepped();
     let mut moved = None;
     loop {
@@ -383,21 +402,25 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
         };
         if reported.is_none_or(|at| at.elapsed() >= FleetService::REPORT_LINKS) {
             reported = Some(Instant::now());
+            for refusal in keys::refusals::take() {
+                tracing::warn!("{refusal}");
+                service
+                    .fleet()
+                    .add_entry(unix_now(), None, Severity::Warning, "refused", refusal, None);
+            }
             service.note_clock_step(&mut clock_step);
             service.note_moved_recording(&mut moved);
             service.end_failed_recording().await;
             if let Some(news) = service.recorder_news(false) {
                 service.tell_recorder(news).await;
             }
-            let now = unix_now();
-            let reports: Vec<_> = service
-                .fleet()
-                .cars()
-                .filter_map(|car| Some((car.name.clone(), car.link_report(now)?)))
-                .collect();
-            for (car, report) in reports {
-                service.client().report(&car, &report).await;
-            }
+            reported_late = reported;
+            service.report_links(|_| true).await;
+        } else if reported_late.is_none_or(|at| at.elapsed() >= FleetService::REPORT_LATE) {
+            reported_late = Some(Instant::now());
+            service
+                .report_links(|report| report.transit - report.uncertainty > FleetService::LATE)
+                .await;
         }
         let compare = compared.is_none_or(|at| at.elapsed() >= FleetService::COMPARE_CLOCKS);
         if compare && !cars.is_empty() {
@@ -411,7 +434,18 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
                         return;
                     }
                     if info {
-                        service.client().fetch_info(&car).await;
+                        let info = service.client().fetch_info(&car).await;
+                        if let Some(text) = info.and_then(|info| version_note(&car, &info.version)) {
+                            let entry_of = Some(car.clone());
+                            service.fleet().add_entry(
+                                unix_now(),
+                                entry_of,
+                                Severity::Warning,
+                                "version",
+                                text,
+                                None,
+                            );
+                        }
                     }
                     if map {
                         service.client().fetch_map(&car).await;
@@ -421,6 +455,17 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
             }
         }
     }
+}
+
+/// Says that a car runs another version than this program; None when it is the same.
+fn version_note(car: &CarName, version: &str) -> Option<String> {
+    let own = env!("CARGO_PKG_VERSION");
+    (version != own).then(|| {
+        format!(
+            "{car} runs version {}, this pit wall {own}: update the older one before the race",
+            protocol::plain_text(version)
+        )
+    })
 }
 
 /// Why a recording cannot be started.
@@ -446,4 +491,18 @@ fn exposure(role: &Role, protection: &Protection) -> Option<String> {
     (!protection.protects()).then(|| {
         format!("unprotected: whoever reaches {endpoint} can read, forge and command every car; see `pitwall keys`")
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_car_of_another_version_is_named() {
+        let car = CarName::new("car-1").expect("a good name");
+        assert_eq!(version_note(&car, env!("CARGO_PKG_VERSION")), None);
+        let note = version_note(&car, "0.0.9\u{1b}]0;").expect("another version");
+        assert!(note.starts_with("car-1 runs version 0.0.9"), "{note}");
+        assert!(!note.contains('\u{1b}'), "{note}");
+    }
 }

@@ -4,7 +4,9 @@ use std::io::ErrorKind;
 use std::process::ExitCode;
 
 use clap::Parser;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer};
 
 use crate::{RecordingError, StartRecordingError, cli, commands, output};
 
@@ -17,7 +19,7 @@ pub fn program() -> ExitCode {
     let usual = if screen {
         "off"
     } else {
-        "warn,zenoh=off,zenoh_transport=off"
+        "warn,zenoh=off,zenoh_transport=off,zenoh_link_tls=off"
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(usual));
     // At debug level zenoh prints its configuration, and with it the password.
@@ -25,11 +27,14 @@ pub fn program() -> ExitCode {
         Ok(quiet) if !screen => filter.add_directive(quiet),
         _ => filter,
     };
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let to_stderr = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .without_time()
         .with_target(false)
+        .with_filter(filter);
+    tracing_subscriber::registry()
+        .with(to_stderr)
+        .with(keys::refusals::watch())
         .init();
     raise_file_limit();
     let outcome = tokio::runtime::Builder::new_multi_thread()

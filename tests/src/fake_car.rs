@@ -40,6 +40,8 @@ pub struct Behaviour {
     pub without_run_token: bool,
     /// It sends scans and all that a real car does at full rate, too.
     pub full_rate: bool,
+    /// It sends ten poses and two health messages a second, and once a second what it is.
+    pub light: bool,
     /// Its distance behind the other cars on the lap, in updates of 25 ms.
     pub updates_behind: u64,
 }
@@ -243,6 +245,9 @@ impl Topics {
 
 /// 40 poses a second, everything else at its rate.
 async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicBool>, behaviour: Behaviour) {
+    if behaviour.light {
+        return drive_light(&topics, &state, &running, behaviour).await;
+    }
     let mut ticks = tokio::time::interval(Duration::from_millis(25));
     let mut update = 0;
     while running.load(Ordering::Relaxed) {
@@ -298,6 +303,26 @@ async fn drive(topics: Topics, state: Arc<Mutex<CarState>>, running: Arc<AtomicB
         if behaviour.malformed_load && update % 40 == 1 {
             let load = Key::new(topics.name.clone(), Topic::Load).to_string();
             topics.session.put(load, vec![0xff; 50]).await.expect("sent");
+        }
+    }
+}
+
+/// The same way with few messages.
+async fn drive_light(topics: &Topics, state: &Mutex<CarState>, running: &AtomicBool, behaviour: Behaviour) {
+    let mut ticks = tokio::time::interval(Duration::from_millis(100));
+    let mut update = 0;
+    while running.load(Ordering::Relaxed) {
+        ticks.tick().await;
+        update += 4;
+        let pose = pose(update, update + 80 - behaviour.updates_behind % 80);
+        topics.put(Topic::Pose, &pose, state).await;
+        if update % 20 == 4 {
+            topics.put(Topic::Health, &health(update), state).await;
+        }
+        if update % 40 == 4 {
+            let params = params(&state.lock().expect("no panic"));
+            topics.put(Topic::Params, &params, state).await;
+            topics.put(Topic::Load, &load(), state).await;
         }
     }
 }

@@ -10,6 +10,8 @@ use system_tests::{
     Behaviour, FakeCar, client, free_endpoint, in_force, named, router, select, send_command,
     start_real_protected, wait_until,
 };
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 use zenoh::Session;
 
 /// A team with a laptop, three cars and a viewer.
@@ -269,6 +271,9 @@ async fn keys_decide_who_commands() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn strangers_stay_outside_and_cars_write_under_their_own_name() {
+    tracing_subscriber::registry()
+        .with(keys::refusals::watch())
+        .init();
     let mut authority = team();
     let endpoint = free_tls_endpoint();
     let stolen = keys_of(&authority, Role::Car, "car-3");
@@ -300,6 +305,16 @@ async fn strangers_stay_outside_and_cars_write_under_their_own_name() {
             .await
             .is_none()
     );
+
+    // The pit wall says why.
+    for why in ["has expired", "does not know the authority"] {
+        wait_until(why, || {
+            let fleet = wall.fleet();
+            let mut refusals = fleet.log().since(0).filter(|entry| entry.kind == "refused");
+            refusals.any(|entry| entry.text.contains(why))
+        })
+        .await;
+    }
 
     // Another car's keys, and revoked ones, connect and are not heard.
     for (protection, name) in [

@@ -1,6 +1,7 @@
 //! `pitwall router`: only passes messages on between cars, pit walls and viewers, by the rules of their keys.
 
 use std::process::ExitCode;
+use std::time::Duration;
 
 use pitwall::open_router;
 use serde_json::json;
@@ -23,7 +24,17 @@ pub(super) async fn run(network: &NetworkOptions, json: bool) -> anyhow::Result<
             "warning: unprotected: whoever reaches this router can read and command every car",
         );
     }
+    let refusals = tokio::spawn(async {
+        let mut ticks = tokio::time::interval(Duration::from_secs(1));
+        loop {
+            ticks.tick().await;
+            for refusal in keys::refusals::take() {
+                tracing::warn!("{refusal}");
+            }
+        }
+    });
     interrupted().await;
+    refusals.abort();
     router.close().await;
     Ok(ExitCode::SUCCESS)
 }

@@ -4,7 +4,10 @@
 //! test-car race NAME START ENDPOINT [STATE [RECORDINGS]]   a real node in a simulated car on the bundled track; STATE is the folder
 //!                                             that its sets are kept in, RECORDINGS that of the recordings on the car
 //! test-car rings COUNT ENDPOINT [full]        fake cars, car-01 to car-COUNT; `full` with scans and all else at full rate
+//! test-car light COUNT ENDPOINT PREFIX        fake cars, PREFIX-01 to PREFIX-COUNT, that send ten poses a second
 //! ```
+//!
+//! Fake cars end after fifteen minutes, or after `TEST_CAR_MINUTES`.
 
 use std::path::Path;
 use std::time::Duration;
@@ -28,10 +31,23 @@ fn main() -> anyhow::Result<()> {
             Some(Path::new(state)),
             record.first().map(Path::new),
         ),
-        ["rings", count, endpoint] => rings(count.parse().context("COUNT")?, endpoint, false),
-        ["rings", count, endpoint, "full"] => rings(count.parse().context("COUNT")?, endpoint, true),
+        ["rings", count, endpoint, ref full @ ..] if full.is_empty() || full == ["full"] => {
+            let behaviour = Behaviour {
+                full_rate: !full.is_empty(),
+                ..Behaviour::default()
+            };
+            rings(count.parse().context("COUNT")?, endpoint, "car", behaviour)
+        }
+        ["light", count, endpoint, prefix] => {
+            let behaviour = Behaviour {
+                light: true,
+                ..Behaviour::default()
+            };
+            rings(count.parse().context("COUNT")?, endpoint, prefix, behaviour)
+        }
         _ => bail!(
-            "usage: test-car race NAME START ENDPOINT [STATE [RECORDINGS]] | rings COUNT ENDPOINT [full]"
+            "usage: test-car race NAME START ENDPOINT [STATE [RECORDINGS]] | rings COUNT ENDPOINT [full] | \
+             light COUNT ENDPOINT PREFIX"
         ),
     }
 }
@@ -50,19 +66,20 @@ fn race(
     Ok(())
 }
 
-fn rings(count: u64, endpoint: &str, full_rate: bool) -> anyhow::Result<()> {
+fn rings(count: u64, endpoint: &str, prefix: &str, behaviour: Behaviour) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     runtime.block_on(async {
         let mut cars = Vec::new();
         for number in 1..=count {
             let behaviour = Behaviour {
-                full_rate,
                 updates_behind: number * 80 / count.max(1),
-                ..Behaviour::default()
+                ..behaviour
             };
-            cars.push(FakeCar::start(&format!("car-{number:02}"), endpoint, behaviour).await);
+            cars.push(FakeCar::start(&format!("{prefix}-{number:02}"), endpoint, behaviour).await);
         }
-        tokio::time::sleep(LONGEST).await;
+        let minutes = std::env::var("TEST_CAR_MINUTES").ok();
+        let minutes = minutes.and_then(|minutes| minutes.parse().ok());
+        tokio::time::sleep(minutes.map_or(LONGEST, Duration::from_mins)).await;
         drop(cars);
     });
     Ok(())

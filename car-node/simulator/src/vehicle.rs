@@ -9,9 +9,13 @@ use crate::{TireParams, VehicleParams, VehicleState};
 /// Runge-Kutta step stays far below a micrometre.
 const STEP: f64 = 0.001_25;
 
-/// Below this rolling speed a tyre's slip is damped as at this speed \[m/s\]. At rest the slip would otherwise be a spring
-/// without a damper (Pacejka, section 8.6).
+/// Below this rolling speed a tyre's force is damped \[m/s\]. At rest its slip would otherwise be a spring without a
+/// damper (Pacejka, section 8.6).
 const LOW_SPEED: f64 = 0.5;
+
+/// Damping of a tyre that stands: slip added per sliding speed \[s/m\]. The car's sideways oscillation on its tyres, at 40
+/// rad/s, is damped with a ratio of 0.6.
+const STANDING_DAMPING: f64 = 0.5;
 
 /// The driver's command.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -27,6 +31,8 @@ pub struct Controls {
 pub struct Vehicle {
     params: VehicleParams,
     state: VehicleState,
+    /// Force that pulls at the centre of gravity, to the left \[N\].
+    side_pull: f64,
 }
 
 impl Vehicle {
@@ -35,6 +41,7 @@ impl Vehicle {
         let mut vehicle = Self {
             params,
             state: VehicleState::default(),
+            side_pull: 0.0,
         };
         vehicle.place(map_from_base_link);
         vehicle
@@ -59,6 +66,11 @@ impl Vehicle {
     /// Changes the grip.
     pub fn set_grip(&mut self, grip: Grip) {
         self.params = self.params.with_grip(grip);
+    }
+
+    /// Pulls at the centre of gravity from now on, to the left of the car \[N\].
+    pub fn set_side_pull(&mut self, force: f64) {
+        self.side_pull = force;
     }
 
     /// The state.
@@ -134,8 +146,10 @@ impl Vehicle {
         let front = [front[0] * cos + front[1] * sin, front[1] * cos - front[0] * sin];
         let rear = [s.vx, s.vy - p.rear_axle * s.yaw_rate];
 
-        let [fx, fy] = p.front_tires.force(front_load, s.front_slip);
-        let [rx, ry] = p.rear_tires.force(rear_load, s.rear_slip);
+        let front_slip = damped(s.front_slip, front, s.wheel_speed);
+        let rear_slip = damped(s.rear_slip, rear, s.wheel_speed);
+        let [fx, fy] = p.front_tires.force(front_load, front_slip);
+        let [rx, ry] = p.rear_tires.force(rear_load, rear_slip);
         // The front force in the car's frame.
         let [front_x, front_y] = [fx * cos - fy * sin, fx * sin + fy * cos];
 
@@ -152,7 +166,7 @@ impl Vehicle {
             y: s.vx * sin_heading + s.vy * cos_heading,
             heading: s.yaw_rate,
             vx: acceleration + s.yaw_rate * s.vy,
-            vy: (front_y + ry) / p.mass - s.yaw_rate * s.vx,
+            vy: (front_y + ry + self.side_pull) / p.mass - s.yaw_rate * s.vx,
             yaw_rate: (p.front_axle * front_y - p.rear_axle * ry) / p.yaw_inertia,
             wheel_speed: (self.motor_force(s.wheel_speed, controls.speed) - rolling - fx - rx)
                 / circumference_mass,
@@ -187,14 +201,33 @@ impl Vehicle {
     }
 }
 
+/// Speed at which a tyre's tread meets the floor \[m/s\].
+fn rolling_speed(axle: [f64; 2], wheel_speed: f64) -> f64 {
+    wheel_speed.abs().max(axle[0].abs())
+}
+
+/// Velocity of the floor under the tread: along the wheel, across it \[m/s\].
+fn sliding_velocity(axle: [f64; 2], wheel_speed: f64) -> [f64; 2] {
+    [wheel_speed - axle[0], -axle[1]]
+}
+
 /// Time derivative of a tyre's slip: the sliding speed builds it up and rolling releases it. Its steady state is the
-/// theoretical slip when driving and the practical slip when braking, so both end at 1.
+/// theoretical slip when driving and the practical slip when braking, so both end at 1. A tyre that stands holds its slip
+/// until it slides; then its slip ends at 1, too.
 fn slip_rate(tires: &TireParams, slip: [f64; 2], axle: [f64; 2], wheel_speed: f64) -> [f64; 2] {
-    let rolling = wheel_speed.abs().max(axle[0].abs()).max(LOW_SPEED);
-    [
-        (wheel_speed - axle[0] - rolling * slip[0]) / tires.relaxation_length,
-        (-axle[1] - rolling * slip[1]) / tires.relaxation_length,
-    ]
+    let sliding = sliding_velocity(axle, wheel_speed);
+    let released = rolling_speed(axle, wheel_speed).max(sliding[0].hypot(sliding[1]).min(LOW_SPEED));
+    [0, 1].map(|k| (sliding[k] - released * slip[k]) / tires.relaxation_length)
+}
+
+/// The slip that makes the force, with the damping of a tyre that hardly rolls.
+fn damped(slip: [f64; 2], axle: [f64; 2], wheel_speed: f64) -> [f64; 2] {
+    let standing = 1.0 - rolling_speed(axle, wheel_speed) / LOW_SPEED;
+    if standing <= 0.0 {
+        return slip;
+    }
+    let sliding = sliding_velocity(axle, wheel_speed);
+    [0, 1].map(|k| slip[k] + STANDING_DAMPING * standing * sliding[k])
 }
 
 #[cfg(test)]

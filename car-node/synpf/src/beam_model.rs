@@ -114,12 +114,80 @@ impl BeamModel {
                     field.trace(from, [angle.cos(), angle.sin()], longest)
                 });
             }
+            Ranges::Exact(grid) => {
+                let resolution = grid.resolution;
+                reweight_by_casting(particles, beams, &laser, field, self, |from, angle, longest| {
+                    let [x, y] = from.map(|cells| f64::from(cells) * resolution);
+                    let laser = grid.origin * Pose::new(x, y, angle.into());
+                    (grid.cast(laser, f64::from(longest) * resolution) / resolution) as f32
+                });
+            }
+            #[cfg(feature = "gpu")]
+            Ranges::Gpu(map) => {
+                if self.reweight_by_gpu(particles, beams, &laser, map).is_err() {
+                    // The card has failed since the set was accepted. From now on the rays are marched here.
+                    self.reweight(
+                        particles,
+                        beams,
+                        field,
+                        &Ranges::RayMarching,
+                        base_link_from_laser,
+                    );
+                }
+            }
             Ranges::Cddt(cddt) => {
                 reweight_by_casting(particles, beams, &laser, field, self, |from, angle, longest| {
                     cddt.range(from, angle, longest)
                 });
             }
         }
+    }
+
+    /// Adds the log-likelihoods that a graphics card computes; nothing if it fails.
+    #[cfg(feature = "gpu")]
+    fn reweight_by_gpu(
+        &self,
+        particles: &mut Particles,
+        beams: &[Beam],
+        laser: &Laser,
+        map: &crate::gpu::GpuMap,
+    ) -> Result<(), crate::gpu::GpuError> {
+        let direction = |beam: &Beam| {
+            let (sin, cos) = (beam.angle + laser.heading).sin_cos();
+            [cos, sin]
+        };
+        let weighed = crate::gpu::WeighedBeams {
+            directions: beams.iter().map(direction).collect(),
+            rows: beams
+                .iter()
+                .map(|beam| &self.row(beam.range)[..self.steps])
+                .collect(),
+            off_track: self.off_track * beams.len() as f32,
+            laser: laser.at,
+            longest: self.reach() * laser.cells,
+            steps_per_cell: 1.0 / (laser.cells * STEP as f32),
+        };
+        let poses = &particles.poses;
+        let pose = |i: usize| {
+            let (c, s) = (poses.cos()[i], poses.sin()[i]);
+            [poses.x()[i] * laser.cells, poses.y()[i] * laser.cells, c, s]
+        };
+        let mut sums = Vec::with_capacity(poses.len());
+        map.weigh(poses.len(), pose, &weighed, |part| sums.extend_from_slice(part))?;
+        for (log_weight, sum) in particles.log_weight.iter_mut().zip(sums) {
+            *log_weight += sum;
+        }
+        Ok(())
+    }
+
+    /// The density of a measured range where the map predicts `predicted` \[m\]: ranges \[m\] with the density \[1/m\], without
+    /// `squash`; the last one is no return.
+    pub(crate) fn density(&self, predicted: f64, squash: f64) -> Vec<[f64; 2]> {
+        let column = ((predicted / STEP) as usize).min(self.steps - 1);
+        let density = |step: usize| (f64::from(self.rows[step * self.length + column]) * squash).exp() / STEP;
+        (0..self.steps)
+            .map(|step| [step as f64 * STEP, density(step)])
+            .collect()
     }
 
     /// The row for a measured range \[m\]; infinite for no return. `N` is [`BeamModel::row_length`].

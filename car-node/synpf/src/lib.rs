@@ -59,6 +59,8 @@ mod correlative_match;
 mod error;
 mod estimate;
 mod global_search;
+#[cfg(feature = "gpu")]
+mod gpu;
 mod innovation_gate;
 mod likelihood_field;
 mod motion_model;
@@ -69,6 +71,7 @@ mod parameters;
 mod particle_estimate;
 mod particle_filter;
 mod particles;
+pub mod parts;
 mod pose_array;
 mod pose_bins;
 mod preprocessed_scan;
@@ -95,6 +98,8 @@ mod validation;
 pub use beam_layout::{BeamLayout, BeamParameters};
 pub use error::SetUpError;
 pub use global_search::{GlobalCheck, GlobalCheckOutcome};
+#[cfg(feature = "gpu")]
+pub use gpu::GpuError;
 pub use localizer::{
     Doubt, Dropped, ExternalPose, HandOver, HandedEstimate, Hypothesis, Job, JobOutcome, Localizer, Mode,
     Odometry, ParameterFault, ParameterValues, PoseError, PoseOf, PreparedParameters, Scan, SensorFinding,

@@ -208,7 +208,6 @@ impl RangeTable {
     }
 
     /// Range from a point \[cells\] for a particle's heading and a beam's direction \[m\], rounded as the beam model does it.
-    #[cfg(test)]
     pub(crate) fn range(&self, from: [f32; 2], heading: f32, beam: f32) -> Option<f32> {
         let row = self.row(self.rows_at(f32x8::splat(from[0]), f32x8::splat(from[1]))[0])?;
         let step = |angle: f32| (angle / std::f32::consts::TAU * DIRECTIONS as f32).round() as i64;

@@ -11,14 +11,18 @@
 //! | CDDT, any direction | that, and r * pi / 256 at a range r | half a step between directions |
 //! | range table | that of CDDT, 0.71, r * pi / 128 and 1.25 mm | centre of the cell in place of the point; the directions of particle and beam are rounded one by one; ranges are stored in steps of 2.5 mm |
 //! | ray marching | 1/4 | interpolation of the field between the cells' centres, with steps of at least a quarter of a cell |
-//! | casting on the grid (`maps::OccupancyGrid::cast`) | 1/2 | it ends at the edges of occupied cells, not at faces |
+//! | casting on the grid (`maps::OccupancyGrid::cast`, `gpu`) | 1/2 | it ends at the edges of occupied cells, not at faces |
 //!
 //! A table with blocks of n x n cells adds up to 1.42 (n - 1): the range is for the cell nearest to the middle of the block.
 //! A set with fewer directions in the table (`theta_discretization`) adds r * pi / directions.
 
 use std::sync::Arc;
 
+use maps::OccupancyGrid;
+
 use crate::cddt::Cddt;
+#[cfg(feature = "gpu")]
+use crate::gpu::GpuMap;
 use crate::range_table::RangeTable;
 
 /// Where predicted ranges come from in the region that the particles are in.
@@ -32,6 +36,11 @@ pub(crate) enum Ranges {
     Interim,
     /// Searched for in the sorted crossings with walls.
     Cddt(Arc<Cddt>),
+    /// Cast on the grid, cell by cell. No set chooses it: it is what the others are compared with.
+    Exact(Arc<OccupancyGrid>),
+    /// Cast on a graphics card.
+    #[cfg(feature = "gpu")]
+    Gpu(Arc<GpuMap>),
 }
 
 #[cfg(test)]

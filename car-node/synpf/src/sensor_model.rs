@@ -46,10 +46,14 @@ impl SensorModel {
             return Ranges::RayMarching;
         };
         let table = parameters.sensor.table_parameters();
+        #[cfg(feature = "gpu")]
+        if method == RangeMethod::Gpu {
+            return map.gpu().map_or(Ranges::RayMarching, Ranges::Gpu);
+        }
         let layout = match (method, region) {
             (RangeMethod::Lut, Some(region)) => map.layout(region),
             (RangeMethod::Cddt, _) => TableLayout::Cddt,
-            (RangeMethod::Lut | RangeMethod::RayMarching, _) => TableLayout::RayMarching,
+            _ => TableLayout::RayMarching,
         };
         match (layout, region) {
             (TableLayout::Table { .. }, Some(region)) => map

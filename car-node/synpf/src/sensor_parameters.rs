@@ -26,6 +26,9 @@ pub enum RangeMethod {
     RayMarching,
     /// Compressed directional distance transform (Walsh and Karaman, ICRA 2018): a fraction of the table's memory.
     Cddt,
+    /// Exact ranges, and the weights too, computed on a graphics card through Vulkan. For many particles. Needs a program
+    /// that was built with the feature `gpu`, and an adapter.
+    Gpu,
 }
 
 /// Parameters of the sensor models.
@@ -86,6 +89,14 @@ impl SensorParameters {
         ] {
             check.range(key, value, 0.0, 1.0);
         }
+        check.that(
+            "range_method",
+            cfg!(feature = "gpu") || self.range_method != RangeMethod::Gpu,
+            || {
+                "gpu needs a program built with the cargo feature gpu; choose lut, cddt or ray_marching"
+                    .into()
+            },
+        );
         let sum = self.z_hit + self.z_short + self.z_max + self.z_rand;
         // The reference's family of files has shares that add up to 0.95.
         check.that("z_hit", (sum - 1.0).abs() < 0.1, || {
@@ -135,5 +146,14 @@ mod tests {
         parameters.sensor.z_hit = 1.0;
         let faults = parameters.validate().expect_err("the sum is 1.15");
         assert_eq!(faults[0].key, "z_hit");
+    }
+
+    #[cfg(not(feature = "gpu"))]
+    #[test]
+    fn a_program_without_the_feature_refuses_gpu() {
+        let mut parameters = Parameters::default();
+        parameters.sensor.range_method = super::RangeMethod::Gpu;
+        let faults = parameters.validate().expect_err("no GPU in this build");
+        assert_eq!(faults[0].key, "range_method");
     }
 }

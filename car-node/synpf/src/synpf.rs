@@ -104,6 +104,11 @@ impl SynPf {
             parameters,
             sensor_model,
         } = Tuning::new(parameters).map_err(SetUpError::Parameters)?;
+        #[cfg(feature = "gpu")]
+        if parameters.sensor.range_method == crate::RangeMethod::Gpu {
+            map.gpu()
+                .map_err(|error| SetUpError::Parameters(vec![crate::tuning::gpu_fault(&error)]))?;
+        }
         Ok(Self {
             base_link_from_laser,
             odometry: OdometryTrack::default(),

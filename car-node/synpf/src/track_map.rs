@@ -7,6 +7,8 @@ use maps::{DistanceField, OccupancyGrid, Pose};
 
 use crate::cddt::Cddt;
 use crate::error::SetUpError;
+#[cfg(feature = "gpu")]
+use crate::gpu::{GpuError, GpuMap};
 use crate::quality::Quality;
 use crate::range_table::{RangeTable, TableParameters};
 use crate::reference::RangeTables;
@@ -32,6 +34,8 @@ pub struct TrackMap {
     layouts: OnceLock<Vec<TableLayout>>,
     score_pyramid: OnceLock<ScorePyramid>,
     reference_tables: RangeTables,
+    #[cfg(feature = "gpu")]
+    gpu: OnceLock<Result<Arc<GpuMap>, GpuError>>,
 }
 
 /// What predicts the ranges in a region where a set asks for a range table.
@@ -83,6 +87,8 @@ impl TrackMap {
             layouts: OnceLock::new(),
             score_pyramid: OnceLock::new(),
             reference_tables: RangeTables::default(),
+            #[cfg(feature = "gpu")]
+            gpu: OnceLock::new(),
         })
     }
 
@@ -259,6 +265,13 @@ impl TrackMap {
     /// A table from a localizer's thread: built at once or made pending, by the policy.
     pub(crate) fn table(&self, key: TableKey) -> Option<Table> {
         self.tables.get(key, || self.new_table(key))
+    }
+
+    /// The map on the graphics card; copied there by the first call.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn gpu(&self) -> Result<Arc<GpuMap>, GpuError> {
+        let copied = self.gpu.get_or_init(|| GpuMap::new(&self.grid).map(Arc::new));
+        copied.clone()
     }
 
     /// The range table of a region; None while another thread has yet to build it.

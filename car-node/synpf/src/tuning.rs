@@ -21,6 +21,10 @@ impl Tuning {
     /// [`TrackMap::prepare`]; see [`Tuning::prepare`] for both at once.
     pub fn new(parameters: Parameters) -> Result<Self, Vec<ParameterFault>> {
         parameters.validate()?;
+        #[cfg(feature = "gpu")]
+        if parameters.sensor.range_method == RangeMethod::Gpu {
+            crate::gpu::Gpu::shared().map_err(|error| vec![gpu_fault(&error)])?;
+        }
         let sensor_model = SensorModel::new(&parameters);
         Ok(Self {
             parameters,
@@ -38,6 +42,15 @@ impl Tuning {
         let tuning = Self::new(parameters)?;
         map.prepare(map_from_base_link, &tuning.parameters);
         Ok(PreparedParameters::new(tuning))
+    }
+}
+
+/// A graphics card that cannot be used, as a fault of the set that asks for it.
+#[cfg(feature = "gpu")]
+pub(crate) fn gpu_fault(error: &crate::gpu::GpuError) -> ParameterFault {
+    ParameterFault {
+        key: "range_method".into(),
+        fault: format!("gpu: {error}"),
     }
 }
 
@@ -79,12 +92,12 @@ impl TrackMap {
                 keys
             }
             RangeMethod::Cddt => vec![TableKey::Cddt],
-            RangeMethod::RayMarching => Vec::new(),
+            RangeMethod::RayMarching | RangeMethod::Gpu => Vec::new(),
         }
     }
 
     /// Memory that [`TrackMap::prepare`] needs with the same arguments \[bytes\], known before anything is built: exact for
-    /// range tables, an upper bound for the CDDT, 0 for ray marching.
+    /// range tables, an upper bound for the CDDT, 0 for ray marching and for a graphics card, which has its own memory.
     pub fn table_bytes_for(&self, map_from_base_link: Option<Pose>, parameters: &Parameters) -> usize {
         let keys = self.needed_tables(map_from_base_link, parameters);
         keys.into_iter().map(|key| self.bytes_for(key)).sum()

@@ -52,6 +52,10 @@ pub(crate) enum Command {
     /// The same seed gives the same race; only the load differs from run to run. Exit code: 0 when every car drove all laps
     /// without a crash, 3 when one did not, 1 for a faulty file, 2 for wrong usage. With --table it is 0.
     Race(Race),
+    /// Draw a figure of the paper, or one that explains SynPF, as SVG.
+    Figure(Figure),
+    /// Pull the simulated car sideways until it slides, on each kind of tyres, as the paper does with its car.
+    GripTest(GripTest),
     /// Make, check or draw a track.
     Track(Track),
     /// Make a parameter set of another localizer's file: SynPF's pf2_params.yaml, MIT's particle filter's, nav2's or ROS 1's
@@ -488,6 +492,38 @@ pub(crate) enum PoseSource {
     Odometry,
     /// The true pose.
     Truth,
+}
+
+/// What can be drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum FigureKind {
+    /// The paper's figure 1: particles of the differential-drive and the race car's motion model, at low and high speed.
+    MotionModels,
+    /// Where the beams of the uniform and the boxed layout end in a corridor.
+    BeamLayouts,
+    /// The density of the beam model.
+    SensorModel,
+    /// The error of each method that predicts ranges.
+    RangeMethods,
+}
+
+/// Arguments of `figure`.
+#[derive(Debug, Args)]
+pub(crate) struct Figure {
+    /// What to draw.
+    #[arg(value_name = "FIGURE")]
+    pub(crate) what: FigureKind,
+    /// File to write; one that exists is overwritten.
+    #[arg(short, long, value_name = "FILE.svg")]
+    pub(crate) out: PathBuf,
+}
+
+/// Arguments of `grip-test`.
+#[derive(Debug, Clone, Copy, Args)]
+pub(crate) struct GripTest {
+    /// One JSON array on stdout.
+    #[arg(long)]
+    pub(crate) json: bool,
 }
 
 /// Arguments of `import`.

@@ -34,6 +34,8 @@ fn main() -> ExitCode {
         Command::Ablate(arguments) => commands::ablate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Stress(arguments) => commands::stress::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Race(arguments) => commands::race::run(&arguments),
+        Command::Figure(arguments) => commands::figure::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::GripTest(arguments) => commands::grip_test::run(arguments).map(|()| ExitCode::SUCCESS),
         Command::Import(arguments) => commands::import::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Doctor(arguments) => commands::doctor::run(&arguments),
         Command::Health { state } => commands::health::run(&state).map(|()| ExitCode::SUCCESS),

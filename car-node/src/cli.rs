@@ -74,8 +74,8 @@ pub(crate) enum Command {
 /// Arguments of `doctor`, as for `run`.
 #[derive(Debug, Args)]
 pub(crate) struct Doctor {
-    /// Map: a map_server YAML file.
-    #[arg(long, value_name = "MAP.yaml")]
+    /// Map: a map_server YAML file, or a Cartographer state (.pbstream).
+    #[arg(long, value_name = "MAP")]
     pub(crate) map: Option<PathBuf>,
     /// The car's name.
     #[arg(long, value_name = "NAME", default_value = "car-1")]
@@ -151,8 +151,9 @@ pub(crate) struct Run {
     /// in the namespace of the scan].
     #[arg(long, value_name = "TOPIC")]
     pub(crate) initial_pose_topic: Option<String>,
-    /// Map: a map_server YAML file. For the simulator, a track: club, hall, park, mirror, or a folder.
-    #[arg(long, value_name = "MAP.yaml|TRACK")]
+    /// Map: a map_server YAML file, or a Cartographer state (.pbstream). For the simulator, a track: club, hall, park, mirror,
+    /// or a folder.
+    #[arg(long, value_name = "MAP|TRACK")]
     pub(crate) map: PathBuf,
     /// Raceline to measure progress along [default: raceline.csv beside the map, if it exists].
     #[arg(long, value_name = "FILE")]
@@ -299,15 +300,15 @@ pub(crate) struct TopicArguments {
 /// Bags, and the map that they were driven on.
 #[derive(Debug, Args)]
 pub(crate) struct Bags {
-    /// Map: a map_server YAML file.
-    #[arg(long, value_name = "MAP.yaml")]
+    /// Map: a map_server YAML file, or a Cartographer state (.pbstream).
+    #[arg(long, value_name = "MAP")]
     pub(crate) map: PathBuf,
     /// Bag: a rosbag2 folder, or a file (.mcap, .db3, .bag of ROS 1), compressed or not; may be repeated.
     #[arg(long = "bag", value_name = "BAG", required = true, num_args = 1..)]
     pub(crate) files: Vec<PathBuf>,
     /// True poses, in place of a topic of the bag (one bag): CSV with stamp_s,x_m,y_m,heading_rad of base_link, as --poses
-    /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad.
-    #[arg(long, value_name = "FILE.csv", conflicts_with = "truth_topic")]
+    /// writes, or stamp_s,laser_x_m,laser_y_m,laser_yaw_rad; or the trajectory of a Cartographer state (.pbstream).
+    #[arg(long, value_name = "FILE", conflicts_with = "truth_topic")]
     pub(crate) truth: Option<PathBuf>,
     /// Start this long after the first scan [s].
     #[arg(long, value_name = "S", default_value = "0", allow_negative_numbers = true, value_parser = log_seconds)]
@@ -529,8 +530,8 @@ pub(crate) struct GripTest {
 /// Arguments of `import`.
 #[derive(Debug, Args)]
 pub(crate) struct Import {
-    /// The other localizer's YAML file; it may hold other nodes, too.
-    #[arg(value_name = "FILE.yaml")]
+    /// The other localizer's YAML file, which may hold other nodes, too, or Cartographer's .lua.
+    #[arg(value_name = "FILE")]
     pub(crate) file: PathBuf,
     /// The set to write [default: FILE_set.yaml in this folder].
     #[arg(long, value_name = "SET.yaml")]

@@ -1,7 +1,7 @@
 //! Maps of race tracks: occupancy grids, racelines, distance fields and exact ray casting.
 //!
-//! The crate reads maps as `map_server` does ([`OccupancyGrid::load`]) and racelines of several tools
-//! ([`Raceline::load`]). It measures ranges and distances on them. It also defines [`Pose`], the rigid transform of the
+//! The crate reads maps as `map_server` does, and Cartographer's states ([`OccupancyGrid::load`]), and racelines of several
+//! tools ([`Raceline::load`]). It measures ranges and distances on them. It also defines [`Pose`], the rigid transform of the
 //! plane that all crates use.
 //!
 //! It never localizes, never simulates and never uses a network. Only the loaders touch files; everything else depends on
@@ -32,6 +32,7 @@ mod grid;
 mod image_file;
 mod map_file;
 mod marching_squares;
+mod pbstream;
 mod pgm;
 mod polyline;
 mod pose;
@@ -47,5 +48,6 @@ pub use error::{MapError, read_text};
 pub use grid::{Cell, OccupancyGrid};
 pub use map_file::{MapMetadata, MapMode};
 pub use marching_squares::{CORNERS, Crossing, zero_lines};
+pub use pbstream::{PbStream, TrajectoryNode, is_pbstream, write_pbstream};
 pub use pose::{Pose, wrap_angle};
 pub use raceline::{Raceline, RacelineFault, RacelinePoint, TrackPosition};

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use serde_saphyr::options::DuplicateKeyPolicy;
 
 use crate::image_file::{decode, encode_png};
+use crate::pbstream::{PbStream, is_pbstream};
 use crate::raster::Raster;
 use crate::{Cell, MapError, OccupancyGrid, Pose, read_text};
 
@@ -194,9 +195,12 @@ impl MapMetadata {
 }
 
 impl OccupancyGrid {
-    /// Reads a map: `path` is the YAML file, which names the image.
+    /// Reads a map: `path` is the YAML file, which names the image, or a state of Cartographer (`.pbstream`).
     pub fn load(path: impl AsRef<Path>) -> Result<Self, MapError> {
         let path = path.as_ref();
+        if is_pbstream(path) {
+            return PbStream::load(path)?.paint();
+        }
         let file = path.display().to_string();
         let yaml = read_text(path)?;
         let metadata = MapMetadata::parse(&file, &yaml)?;

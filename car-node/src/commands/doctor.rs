@@ -167,7 +167,7 @@ fn map(file: &Path) -> Check {
             "map",
             Outcome::Bad,
             error.to_string(),
-            "give a map_server YAML file with --map",
+            "give a map_server YAML file or a .pbstream with --map",
         ),
         Ok(grid) => good(
             "map",

@@ -32,11 +32,11 @@ use std::sync::Arc;
 
 use anyhow::{Context, bail};
 use car_node::control::parameter_sets::{self, NamedSet, SetError};
-use car_node::evaluate::read_poses;
+use car_node::evaluate::{read_poses, read_trajectory};
 use car_node::localization::EXTERNAL;
 use car_node::sensors::bag::{Bag, SensorLog, Topics};
 use car_node::sensors::frames::Mount;
-use maps::{MapError, OccupancyGrid};
+use maps::{MapError, OccupancyGrid, is_pbstream};
 use simulator::{BUNDLED, Track};
 use synpf::{PoseOf, TrackMap};
 
@@ -70,7 +70,11 @@ fn read_bags(bags: &Bags) -> anyhow::Result<Vec<(&Path, SensorLog)>> {
         let mut log = read_bag(bag, &bags.topics)?;
         if let Some(truth) = &bags.truth {
             let mount = log.mount.unwrap_or_else(Mount::typical);
-            log.truth = read_poses(truth, mount.base_link_from_laser)?;
+            log.truth = if is_pbstream(truth) {
+                read_trajectory(truth)?
+            } else {
+                read_poses(truth, mount.base_link_from_laser)?
+            };
         }
         if bags.from > 0.0 || bags.lasting.is_some() {
             log.keep(bags.from, bags.lasting.unwrap_or(f64::INFINITY));

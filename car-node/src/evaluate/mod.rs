@@ -19,7 +19,7 @@ pub use consistency::{Consistency, Nees};
 pub(crate) use errors::SETTLING;
 pub use errors::{PoseErrors, Summaries};
 pub use faults::{Fault, FaultKind};
-pub use pose_file::{PoseFileError, read_poses};
+pub use pose_file::{PoseFileError, read_poses, read_trajectory};
 pub use states::{FaultReport, StateChange, StateTruth, States};
 pub use truth::Truth;
 

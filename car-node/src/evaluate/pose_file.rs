@@ -4,7 +4,7 @@ use std::fs::File;
 use std::path::Path;
 
 use csv::{ReaderBuilder, StringRecord, Trim};
-use maps::Pose;
+use maps::{MapError, PbStream, Pose, wrap_angle};
 use synpf::Stamp;
 
 use crate::sensors::bag::StampedPoses;
@@ -44,6 +44,37 @@ pub enum PoseFileError {
         /// Its text.
         value: String,
     },
+}
+
+/// Between two nodes that are closer than this \[m, rad\] the car stood. Cartographer adds one every 5 s then.
+const STOOD: [f64; 2] = [0.02, 0.02];
+/// The longest such pause that is filled \[s\].
+const LONGEST_PAUSE: f64 = 5.5;
+/// In a pause there is a pose this often \[s\].
+const PAUSE_STEP: f64 = 0.1;
+
+/// Reads the trajectory of a Cartographer state, as poses of `base_link`: that is the tracking frame unless a team has chosen
+/// the IMU's. While the car stood, poses between the nodes are added.
+///
+/// # Errors
+/// When the file cannot be read.
+pub fn read_trajectory(path: &Path) -> Result<StampedPoses, MapError> {
+    let state = PbStream::load(path)?;
+    let mut poses = StampedPoses::new();
+    for node in state.nodes() {
+        let stamp = Stamp(node.stamp);
+        if let Some(&(last, pose)) = poses.last() {
+            let pause: f64 = stamp.since(last);
+            let stood = pose.distance(node.pose) < STOOD[0]
+                && wrap_angle(node.pose.heading - pose.heading).abs() < STOOD[1];
+            if stood && pause < LONGEST_PAUSE {
+                let steps = (pause / PAUSE_STEP).floor() as usize;
+                poses.extend((1..steps).map(|step| (last.plus(PAUSE_STEP * step as f64), pose)));
+            }
+        }
+        poses.push((stamp, node.pose));
+    }
+    Ok(poses)
 }
 
 /// Reads poses of `base_link` in `map`. The first line, with or without a `#`, names the columns: `stamp_s x_m y_m

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use car_node::evaluate::read_poses;
 use car_node::sensors::bag::{Bag, Topics};
-use maps::{OccupancyGrid, Raceline};
+use maps::{OccupancyGrid, PbStream, Pose as MapPose, Raceline, TrajectoryNode, write_pbstream};
 use pitwall::{
     EventPayload, Fleet, FleetEvent, Recorder, Replay, Report, SessionIndex, read_events, read_in_order,
 };
@@ -64,8 +64,8 @@ const PNG: [u8; 67] = [
 
 impl Files {
     /// Recording; bags of ROS 2 in MCAP and SQLite, and of ROS 1; map as YAML, PGM, PNG; raceline as CSV and JSON; a bag's
-    /// metadata, parameters, track, poses, keys, index of sessions.
-    pub(crate) const KINDS: usize = 15;
+    /// metadata, parameters, track, poses, keys, index of sessions; a Cartographer state.
+    pub(crate) const KINDS: usize = 16;
 
     pub(crate) fn new() -> Self {
         let folder = tempfile::tempdir().expect("a folder");
@@ -87,6 +87,7 @@ impl Files {
             POSES.into(),
             KEYS.into(),
             index_of_sessions(folder.path()),
+            pbstream(),
         ];
         Self { folder, samples }
     }
@@ -119,7 +120,11 @@ impl Files {
                 tally.add(read_poses(&file, maps::Pose::IDENTITY).is_ok());
             }
             13 => tally.add(keys::Bundle::read(&self.write("damaged.keys", bytes)).is_ok()),
-            _ => self.read_index(bytes, tally),
+            14 => self.read_index(bytes, tally),
+            _ => {
+                let state = PbStream::read("drive.pbstream", bytes);
+                tally.add(state.and_then(|state| state.paint()).is_ok());
+            }
         }
     }
 
@@ -288,6 +293,17 @@ fn ros1_bag() -> Vec<u8> {
         &content,
     );
     [b"#ROSBAG V2.0\n".to_vec(), record(&head, &[b' '; 64]), chunk].concat()
+}
+
+/// A state with two submaps and a few nodes.
+fn pbstream() -> Vec<u8> {
+    let map = OccupancyGrid::from_parts(YAML, PGM.as_bytes()).expect("a map");
+    let node = |k: i64| TrajectoryNode {
+        stamp: k * 50_000_000,
+        pose: MapPose::new(0.1 * k as f64, 0.0, 0.0),
+    };
+    let nodes: Vec<TrajectoryNode> = (0..4).map(node).collect();
+    write_pbstream(&map, &[MapPose::IDENTITY, MapPose::new(1.0, 0.0, 0.5)], &nodes)
 }
 
 /// What report, check, export, merge and replay read of a recording.

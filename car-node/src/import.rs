@@ -1,11 +1,12 @@
-//! Other localizers' parameter files: SynPF's, MIT's particle filter's, nav2's (and ROS 1's) AMCL's. Each value is taken,
-//! converted, or has no counterpart, and the reason is given.
+//! Other localizers' parameter files: SynPF's, MIT's particle filter's, nav2's (and ROS 1's) AMCL's, and Cartographer's Lua.
+//! Each value is taken, converted, or has no counterpart, and the reason is given.
 //!
 //! Their keys look alike and mean different things: MIT's `sigma_hit` is in cells, SynPF's in metres; AMCL's `alpha1` acts on
 //! variances, SynPF's `alpha_1_amcl` on standard deviations.
 
 use std::collections::BTreeMap;
 
+use pose_graph::{LuaConfiguration, PoseGraphParameters};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use synpf::ParameterFault;
@@ -22,6 +23,8 @@ pub enum Dialect {
     Mit,
     /// AMCL of nav2, or of ROS 1.
     Amcl,
+    /// Cartographer's Lua.
+    Cartographer,
 }
 
 impl Dialect {
@@ -31,6 +34,7 @@ impl Dialect {
             Self::SynPf => "SynPF",
             Self::Mit => "MIT's particle filter",
             Self::Amcl => "AMCL",
+            Self::Cartographer => "Cartographer",
         }
     }
 }
@@ -84,8 +88,18 @@ pub struct Import {
     pub dialect: Dialect,
     /// What became of each value, by key.
     pub values: Vec<Imported>,
-    /// The values of the set that differ from `hq`.
+    /// The values of the set that differ from `hq`, or from Cartographer's defaults.
     pub set: BTreeMap<String, Value>,
+}
+
+impl Import {
+    /// What a value has that is not in the set.
+    pub fn base(&self) -> &'static str {
+        match self.dialect {
+            Dialect::Cartographer => "Cartographer's defaults",
+            _ => "hq",
+        }
+    }
 }
 
 /// Why a file cannot be imported.
@@ -97,6 +111,9 @@ pub enum ImportError {
     /// It has none of the keys of the localizers that are known.
     #[error("these are not the parameters of SynPF, MIT's particle filter or AMCL{}", keys(.0))]
     Foreign(Vec<String>),
+    /// Lua that sets nothing of Cartographer's.
+    #[error("this Lua sets no parameter of Cartographer's")]
+    Lua,
     /// The values do not make a set.
     #[error("{}", .0.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
     Faults(Vec<ParameterFault>),
@@ -163,6 +180,7 @@ pub fn import(text: &str, resolution: f64) -> Result<Import, ImportError> {
                 Dialect::SynPf => of_synpf(key, value),
                 Dialect::Mit => of_mit(key, value, resolution),
                 Dialect::Amcl => of_amcl(key, value, table),
+                Dialect::Cartographer => of_cartographer(key, value),
             },
         })
         .collect();
@@ -173,7 +191,7 @@ pub fn import(text: &str, resolution: f64) -> Result<Import, ImportError> {
         }
     }
     match dialect {
-        Dialect::SynPf => {}
+        Dialect::SynPf | Dialect::Cartographer => {}
         Dialect::Mit => {
             given.insert("motion_model".into(), "mit".into());
             given.insert("beam_layout".into(), "uniform".into());
@@ -202,6 +220,103 @@ pub fn import(text: &str, resolution: f64) -> Result<Import, ImportError> {
             .filter(|(key, value)| given.contains_key(key) && plain.get(key) != Some(value))
             .collect(),
     })
+}
+
+/// Reads Cartographer's Lua. A fault names its line.
+pub fn import_lua(text: &str) -> Result<Import, ImportError> {
+    let read = LuaConfiguration::parse(text).map_err(ImportError::Faults)?;
+    if read.ignored.len() == read.values.len() {
+        return Err(ImportError::Lua);
+    }
+    let included = read.includes.iter().map(|file| Imported {
+        key: "include".into(),
+        value: file.as_str().into(),
+        outcome: none("it is not read: what it sets has Cartographer's default here; add the values of a team's own file"),
+    });
+    let values = read.values.iter().map(|(path, value)| Imported {
+        key: path.clone(),
+        value: value.clone(),
+        outcome: of_cartographer(path, value),
+    });
+    let defaults = PoseGraphParameters::default().to_values();
+    let set = read.parameters.to_values().into_iter();
+    Ok(Import {
+        dialect: Dialect::Cartographer,
+        values: included.chain(values).collect(),
+        set: set
+            .filter(|(key, value)| defaults.get(key) != Some(value))
+            .collect(),
+    })
+}
+
+/// A value of Cartographer's Lua, by its path.
+fn of_cartographer(path: &str, value: &Value) -> Outcome {
+    let key = path.strip_prefix("options.").unwrap_or(path);
+    if PoseGraphParameters::default().to_values().contains_key(key) {
+        return taken(key, value.clone());
+    }
+    let last = key.rsplit('.').next().unwrap_or(key);
+    if key.starts_with("trajectory_builder_3d.") || last.ends_with("_3d") || key.contains("_3d.") {
+        return none("it belongs to Cartographer in three dimensions");
+    }
+    if key.starts_with("map_builder.") {
+        return match last {
+            "num_background_threads" => none("the back end has one worker"),
+            "use_trajectory_builder_2d" => none("there are two dimensions only"),
+            _ => none("there is one kind of map builder"),
+        };
+    }
+    match last {
+        "map_frame"
+        | "tracking_frame"
+        | "published_frame"
+        | "odom_frame"
+        | "provide_odom_frame"
+        | "publish_frame_projected_to_2d"
+        | "publish_to_tf"
+        | "publish_tracked_pose"
+        | "use_pose_extrapolator" => {
+            none("frames come from the messages and /tf_static; what is published is set on the command line")
+        }
+        "use_odometry" => none("odometry is always used"),
+        "use_nav_sat" | "use_landmarks" | "collate_landmarks" | "collate_fixed_frame" => {
+            none("only scans, odometry and a gyroscope are used")
+        }
+        "num_laser_scans" | "num_multi_echo_laser_scans" | "num_point_clouds" => {
+            none("one scanner is used; --scan-topic names it")
+        }
+        "num_subdivisions_per_laser_scan" | "num_accumulated_range_data" => {
+            none("each scan is matched as a whole, its beams brought to its stamp by odometry")
+        }
+        "lookup_transform_timeout_sec"
+        | "submap_publish_period_sec"
+        | "pose_publish_period_sec"
+        | "trajectory_publish_period_sec" => none("what is published, and how often, is set at the pit wall"),
+        "rangefinder_sampling_ratio" => none("every scan is used"),
+        "fixed_frame_pose_sampling_ratio" | "imu_sampling_ratio" | "landmarks_sampling_ratio" => {
+            none("every gyroscope reading is used; there are no landmarks")
+        }
+        "min_z" | "max_z" => none("a scan has no height"),
+        "imu_gravity_time_constant" | "acceleration_weight" | "rotation_weight"
+            if key.contains("optimization_problem") || last == "imu_gravity_time_constant" =>
+        {
+            none("gravity is not estimated in two dimensions")
+        }
+        "max_constraint_distance" => none("a node is matched where it lies on the map, whatever its submap"),
+        "num_threads" | "use_nonmonotonic_steps" => none("the solver is another one, on one thread"),
+        "log_matches" | "log_solver_summary" | "log_residual_histograms" => none("matches are not logged"),
+        "max_num_final_iterations" => none("a drive on a known map has no final optimization"),
+        "grid_type" | "range_data_inserter_type" => none("submaps are probability grids"),
+        "fixed_frame_pose_translation_weight"
+        | "fixed_frame_pose_rotation_weight"
+        | "fixed_frame_pose_use_tolerant_loss"
+        | "fixed_frame_pose_tolerant_loss_param_a"
+        | "fixed_frame_pose_tolerant_loss_param_b" => none("there are no fixed-frame poses"),
+        _ if key.contains("tsdf_range_data_inserter") => none("submaps are probability grids"),
+        _ if key.contains("pose_extrapolator") => none("odometry's own poses are interpolated"),
+        _ if key.contains("overlapping_submaps_trimmer") => none("all submaps but the last few are trimmed"),
+        _ => Outcome::Unknown,
+    }
 }
 
 /// The table of a localizer we know: the file, or what is below a node's name, a namespace and `ros__parameters`.
@@ -504,9 +619,13 @@ fn of_amcl(key: &str, value: &Value, table: &Map<String, Value>) -> Outcome {
 /// The set as a file that `--params` reads.
 pub fn to_yaml(import: &Import, source: &str) -> String {
     let mut text = format!(
-        "# Made by `car-node import` from {source}, parameters of {}.\n# What is not here is as in hq.\n",
-        import.dialect.name()
+        "# Made by `car-node import` from {source}, parameters of {}.\n# What is not here is as in {}.\n",
+        import.dialect.name(),
+        import.base()
     );
+    if import.dialect == Dialect::Cartographer {
+        text += "localizer: pose-graph\n";
+    }
     for (key, value) in &import.set {
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         text += &[key.as_str(), ": ", &value, "\n"].concat();
@@ -605,5 +724,36 @@ mod tests {
         assert!(
             matches!(outcome(&text, "angle_step"), Outcome::NoCounterpart { why } if why.contains("no number"))
         );
+    }
+
+    #[test]
+    fn cartographers_lua_becomes_a_set_for_the_pose_graph() {
+        let text = "include \"map_builder.lua\"\noptions = { tracking_frame = \"base_link\", odometry_sampling_ratio = 0.5 }\n\
+                    TRAJECTORY_BUILDER_2D.submaps.num_range_data = 80\nTRAJECTORY_BUILDER_2D.min_z = -1\n\
+                    POSE_GRAPH.constraint_builder.min_score = 0.62\nPOSE_GRAPH.optimize_every_n_nodes = 90\n\
+                    POSE_GRAPH.colour = 3\n";
+        let import = import_lua(text).expect("Cartographer's");
+        let expected = PoseGraphParameters {
+            odometry_sampling_ratio: 0.5,
+            submaps_num_range_data: 80,
+            min_score: 0.62,
+            ..PoseGraphParameters::default()
+        };
+        assert_eq!(set_of(&import), expected.into());
+        let explained = |key: &str, part: &str| matches!(outcome(&import, key), Outcome::NoCounterpart { why } if why.contains(part));
+        assert!(explained("include", "not read"));
+        assert!(explained("options.tracking_frame", "/tf_static"));
+        assert!(explained("trajectory_builder_2d.min_z", "no height"));
+        assert_eq!(outcome(&import, "pose_graph.colour"), &Outcome::Unknown);
+        let key = "pose_graph.optimize_every_n_nodes";
+        assert_eq!(
+            outcome(&import, key),
+            &taken(key, 90),
+            "the default is taken, too"
+        );
+        assert!(!import.set.contains_key(key));
+        assert!(matches!(import_lua("x = 3\n"), Err(ImportError::Lua)));
+        let faulty = import_lua("POSE_GRAPH.a = {\n").expect_err("open").to_string();
+        assert!(faulty.contains("line"), "{faulty}");
     }
 }

@@ -17,6 +17,10 @@ pub struct LuaConfiguration {
     pub parameters: PoseGraphParameters,
     /// Values in the file that localization on a known map has no use for, as paths in lower case.
     pub ignored: Vec<String>,
+    /// All values in the file, by their paths in lower case.
+    pub values: BTreeMap<String, Value>,
+    /// Files that it includes. They are not read: Cartographer's own are the defaults.
+    pub includes: Vec<String>,
 }
 
 /// Largest file \[bytes\].
@@ -39,20 +43,40 @@ impl LuaConfiguration {
             at: 0,
             values: numbers(&defaults),
             set: BTreeMap::new(),
+            includes: Vec::new(),
         };
         reader.file().map_err(|fault| vec![fault])?;
         let known = defaults.to_values();
         let (mut given, mut ignored) = (Vec::new(), Vec::new());
+        let mut values = BTreeMap::new();
         for (path, value) in reader.set {
-            let key = path.strip_prefix("options.").unwrap_or(&path).to_owned();
-            match known.get(&key) {
-                Some(default) => given.push((key, as_default(value, default))),
-                None => ignored.push(path),
-            }
+            let key = set_key(&path);
+            let value = match known.get(key) {
+                Some(default) => {
+                    let value = as_default(value, default);
+                    given.push((key.to_owned(), value.clone()));
+                    value
+                }
+                None => {
+                    ignored.push(path.clone());
+                    as_default(value, &Value::from(0))
+                }
+            };
+            values.insert(path, value);
         }
         let (parameters, _) = defaults.with_values(given)?;
-        Ok(Self { parameters, ignored })
+        Ok(Self {
+            parameters,
+            ignored,
+            values,
+            includes: reader.includes,
+        })
     }
+}
+
+/// The key of a set that a path in a file means.
+fn set_key(path: &str) -> &str {
+    path.strip_prefix("options.").unwrap_or(path)
 }
 
 /// A value as JSON, as whole number where the default is one.
@@ -172,6 +196,8 @@ struct Reader {
     values: BTreeMap<String, f64>,
     /// What the file sets.
     set: BTreeMap<String, Literal>,
+    /// Files that it includes.
+    includes: Vec<String>,
 }
 
 /// A table or a name of one has no value of its own.
@@ -183,10 +209,10 @@ impl Reader {
             match token {
                 Token::Name(name) if name == "include" => {
                     self.at += 1;
-                    let text = matches!(self.peek(), Some(Token::Text(_)));
-                    if !text {
+                    let Some(Token::Text(file)) = self.peek().cloned() else {
                         return Err(self.fault("include needs the name of a file"));
-                    }
+                    };
+                    self.includes.push(file);
                     self.at += 1;
                 }
                 Token::Name(name) if name == "return" => return Ok(()),
@@ -419,6 +445,13 @@ return options
             "options.num_laser_scans",
         ];
         assert_eq!(read.ignored, ignored);
+        assert_eq!(read.includes, ["map_builder.lua"]);
+        assert_eq!(read.values.len(), 12);
+        assert_eq!(read.values["options.num_laser_scans"], 1);
+        assert_eq!(
+            read.values["trajectory_builder.pure_localization_trimmer.max_submaps_to_keep"],
+            5
+        );
     }
 
     #[test]

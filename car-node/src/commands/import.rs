@@ -5,7 +5,7 @@ use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
-use car_node::import::{Import, Outcome, import, to_yaml};
+use car_node::import::{Import, Outcome, import, import_lua, to_yaml};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -23,7 +23,15 @@ struct Report<'a> {
 pub(crate) fn run(arguments: &cli::Import) -> anyhow::Result<()> {
     let file = &arguments.file;
     let text = maps::read_text(file)?;
-    let import = import(&text, arguments.resolution).with_context(|| file.display().to_string())?;
+    let lua = file
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("lua"));
+    let import = if lua {
+        import_lua(&text)
+    } else {
+        import(&text, arguments.resolution)
+    };
+    let import = import.with_context(|| file.display().to_string())?;
     let name = file.file_name().unwrap_or_default().to_string_lossy();
     let out = arguments.out.clone().unwrap_or_else(|| {
         let stem = file.file_stem().unwrap_or_default().to_string_lossy();
@@ -87,7 +95,8 @@ fn print(import: &Import, name: &str, out: &std::path::Path) {
     }
     let count = import.set.len();
     say!(
-        "{count} values differ from hq: {}. Use it with --params {}",
+        "{count} values differ from {}: {}. Use it with --params {}",
+        import.base(),
         out.display(),
         out.display()
     );

@@ -4,10 +4,9 @@ use std::sync::Arc;
 
 use maps::Pose;
 
-use crate::branch_and_bound::FastMatch;
 use crate::constraint_builder::{Search, match_with_map};
 use crate::frozen_map::FrozenMap;
-use crate::graph::{Graph, NodeId};
+use crate::graph::{Graph, MapMatch, NodeId};
 use crate::parameters::PoseGraphParameters;
 
 /// A node that is to be matched.
@@ -39,7 +38,7 @@ pub(crate) struct NodeMatch {
     pub(crate) node: NodeId,
     pub(crate) search: Search,
     pub(crate) predicted: Pose,
-    pub(crate) found: FastMatch,
+    pub(crate) found: MapMatch,
 }
 
 /// What has come of it.
@@ -71,7 +70,7 @@ impl BackEndWork {
             if matched.search == Search::Anywhere && !self.graph.is_anchored() {
                 self.graph.place(matched.node, matched.found.pose);
             }
-            self.graph.add_match(matched.node, matched.found.pose);
+            self.graph.add_match(matched.node, matched.found);
         }
         if self.optimize {
             self.graph.optimize(&self.parameters);

@@ -1,10 +1,12 @@
 //! The constraint builder: matches of nodes with the frozen map.
 
 use maps::Pose;
+use nalgebra::Matrix2;
 
-use crate::branch_and_bound::{FastMatch, SearchWindow};
+use crate::branch_and_bound::SearchWindow;
 use crate::frozen_map::FrozenMap;
-use crate::nonlinear_matcher::{MatchWeights, nonlinear_match};
+use crate::graph::MapMatch;
+use crate::nonlinear_matcher::{MatchWeights, nonlinear_match, shape_of_information};
 use crate::parameters::PoseGraphParameters;
 
 /// Where to look for a node.
@@ -22,7 +24,7 @@ pub(crate) fn match_with_map(
     points: &[[f32; 2]],
     search: Search,
     parameters: &PoseGraphParameters,
-) -> Option<FastMatch> {
+) -> Option<MapMatch> {
     let stack = map.stack(parameters.branch_and_bound_depth);
     let found = match search {
         Search::Around(pose) => {
@@ -41,5 +43,10 @@ pub(crate) fn match_with_map(
         max_num_iterations: parameters.constraint_max_num_iterations,
     };
     let pose = nonlinear_match(&map.grid, points, found.pose, found.pose, weights);
-    Some(FastMatch { pose, ..found })
+    let shape = if parameters.match_weights_by_information {
+        shape_of_information(&map.grid, points, pose)
+    } else {
+        Matrix2::identity()
+    };
+    Some(MapMatch { pose, shape })
 }

@@ -1,8 +1,9 @@
 //! The pose graph: nodes, the submaps that they are in, and their matches with the frozen map.
 
 use maps::Pose;
+use nalgebra::Matrix2;
 
-use crate::optimization::{Problem, Relative, Weights};
+use crate::optimization::{InMap, Problem, Relative, Weights};
 use crate::parameters::PoseGraphParameters;
 use crate::submap::SubmapId;
 
@@ -20,7 +21,15 @@ pub(crate) struct Node {
     /// By odometry.
     pub(crate) odom: Pose,
     submaps: Vec<SubmapId>,
-    matched: Option<Pose>,
+    matched: Option<MapMatch>,
+}
+
+/// Where a node stands in the frozen map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct MapMatch {
+    pub(crate) pose: Pose,
+    /// By how much each direction counts, see [`InMap`].
+    pub(crate) shape: Matrix2<f64>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -39,6 +48,8 @@ pub(crate) struct Graph {
     next_id: NodeId,
     /// The transform before anything is optimized.
     start: Pose,
+    /// The transform by the last node that was optimized, if that is to count.
+    by_node: Option<Pose>,
 }
 
 impl Graph {
@@ -49,6 +60,7 @@ impl Graph {
             submaps: Vec::new(),
             next_id,
             start: global_from_local,
+            by_node: None,
         }
     }
 
@@ -57,8 +69,11 @@ impl Graph {
         self.next_id
     }
 
-    /// The local frame's pose in the grid's, by the last submap that was optimized.
+    /// The local frame's pose in the grid's, by the last node or the last submap that was optimized.
     pub(crate) fn global_from_local(&self) -> Pose {
+        if let Some(by_node) = self.by_node {
+            return by_node;
+        }
         let last = self.submaps.iter().rev().find(|submap| submap.optimized);
         last.map_or(self.start, |submap| submap.global * submap.local.inverse())
     }
@@ -115,9 +130,9 @@ impl Graph {
     }
 
     /// Adds a node's match with the frozen map. A node that has been trimmed is ignored.
-    pub(crate) fn add_match(&mut self, node: NodeId, global: Pose) {
+    pub(crate) fn add_match(&mut self, node: NodeId, matched: MapMatch) {
         if let Ok(index) = self.nodes.binary_search_by_key(&node, |node| node.id) {
-            self.nodes[index].matched = Some(global);
+            self.nodes[index].matched = Some(matched);
         }
     }
 
@@ -139,6 +154,12 @@ impl Graph {
             (submap.global, submap.optimized) = (by * submap.global, true);
         }
         self.start = by * self.start;
+        self.by_node = self.by_node.map(|pose| by * pose);
+    }
+
+    /// The last node's pose by local scan matching.
+    pub(crate) fn last_local(&self) -> Option<Pose> {
+        self.nodes.last().map(|node| node.local)
     }
 
     /// The nodes in the window, oldest first.
@@ -160,6 +181,11 @@ impl Graph {
         for (submap, pose) in self.submaps.iter_mut().zip(&problem.submaps) {
             (submap.global, submap.optimized) = (*pose, true);
         }
+        let last = self
+            .nodes
+            .last()
+            .filter(|_| parameters.local_to_global_by_last_node);
+        self.by_node = last.map(|node| node.global * node.local.inverse());
     }
 
     fn problem(&self, parameters: &PoseGraphParameters) -> Problem {
@@ -203,10 +229,13 @@ impl Graph {
                 };
                 in_submap.push((submap, relative));
             }
-            in_map.extend(node.matched.map(|measured| Relative {
-                node: index,
-                measured,
-                weights: inter,
+            in_map.extend(node.matched.map(|matched| InMap {
+                at: Relative {
+                    node: index,
+                    measured: matched.pose,
+                    weights: inter,
+                },
+                shape: matched.shape,
             }));
         }
         Problem {
@@ -237,6 +266,7 @@ impl Graph {
             }
         }
         self.start = optimized.global_from_local();
+        self.by_node = optimized.by_node;
         let global_from_local = self.global_from_local();
         let newest = optimized.nodes.last().map_or(0, |node| node.id);
         let newest_submap = optimized.submaps.last().map_or(0, |submap| submap.id);
@@ -253,12 +283,23 @@ impl Graph {
 mod tests {
     use super::*;
 
-    /// A straight drive whose local frame drifts to the left, matched with the map every tenth node.
+    fn found(pose: Pose) -> MapMatch {
+        MapMatch {
+            pose,
+            shape: Matrix2::identity(),
+        }
+    }
+
     fn driven(nodes: usize, keep: usize) -> Graph {
+        driven_with(nodes, keep, &PoseGraphParameters::default())
+    }
+
+    /// A straight drive whose local frame drifts to the left, matched with the map every tenth node.
+    fn driven_with(nodes: usize, keep: usize, parameters: &PoseGraphParameters) -> Graph {
         let parameters = PoseGraphParameters {
             odometry_translation_weight: 0.0,
             odometry_rotation_weight: 0.0,
-            ..PoseGraphParameters::default()
+            ..parameters.clone()
         };
         let mut graph = Graph::new(Pose::IDENTITY, 0);
         for k in 0..nodes {
@@ -271,7 +312,7 @@ mod tests {
                 .collect();
             let (id, _) = graph.add(local, Pose::IDENTITY, &submaps, keep);
             if k % 10 == 0 {
-                graph.add_match(id, Pose::new(x, 0.0, 0.0));
+                graph.add_match(id, found(Pose::new(x, 0.0, 0.0)));
                 graph.optimize(&parameters);
             }
         }
@@ -286,6 +327,24 @@ mod tests {
         assert!(last.global.y.abs() < 0.05, "{:?}", last.global);
         let now = graph.global_from_local() * last.local;
         assert!(now.y.abs() < 0.05, "{now:?}");
+    }
+
+    #[test]
+    fn the_local_frame_stands_where_the_last_node_says_if_that_is_to_count() {
+        let off = |local_to_global_by_last_node| {
+            let parameters = PoseGraphParameters {
+                local_to_global_by_last_node,
+                local_slam_pose_translation_weight: 300.0,
+                local_slam_pose_rotation_weight: 1000.0,
+                ..PoseGraphParameters::default()
+            };
+            // Optimized with the last node.
+            let graph = driven_with(101, 5, &parameters);
+            let last = graph.nodes().last().expect("a node");
+            (graph.global_from_local() * last.local).distance(last.global)
+        };
+        assert!(off(true) < 1e-9, "{}", off(true));
+        assert!(off(false) < 0.05, "{}", off(false));
     }
 
     #[test]
@@ -313,6 +372,6 @@ mod tests {
         assert_eq!(newest.id, id);
         assert!((newest.global.y - before.y - 1.0).abs() < 1e-9);
         // Of a trimmed node nothing is learned.
-        graph.add_match(10_000, Pose::IDENTITY);
+        graph.add_match(10_000, found(Pose::IDENTITY));
     }
 }

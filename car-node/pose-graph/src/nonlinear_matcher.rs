@@ -1,7 +1,7 @@
 //! The non-linear scan matcher: least squares between the end points and the grid (Hess et al., ICRA 2016, equation CS).
 
 use maps::Pose;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix2, Matrix3, SymmetricEigen, Vector2, Vector3};
 
 use crate::probability_grid::ProbabilityGrid;
 use crate::scan_points::transformed;
@@ -112,6 +112,24 @@ pub(crate) fn nonlinear_match(
     pose
 }
 
+/// By how much each direction of the map counts in a match: the square root of the information that the end points have of it,
+/// as a share of that of the best known direction. Along a straight without features that is close to nothing.
+pub(crate) fn shape_of_information(grid: &ProbabilityGrid, points: &[[f32; 2]], pose: Pose) -> Matrix2<f64> {
+    let (sin, cos) = pose.heading.sin_cos();
+    let mut information = Matrix2::zeros();
+    for &point in points {
+        let gradient = Vector2::from(grid.sample(transformed([sin, cos], pose, point)).gradient);
+        information += gradient * gradient.transpose();
+    }
+    let eigen = SymmetricEigen::new(information);
+    let most = eigen.eigenvalues.max();
+    if !(most > 0.0) {
+        return Matrix2::identity();
+    }
+    let share = eigen.eigenvalues.map(|value| (value.max(0.0) / most).sqrt());
+    eigen.eigenvectors * Matrix2::from_diagonal(&share) * eigen.eigenvectors.transpose()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -166,5 +184,25 @@ mod tests {
         let start = Pose::new(3.05, 1.96, 0.53);
         let found = nonlinear_match(&room_grid(), &[], start, start, WEIGHTS);
         assert!(found.distance(start) < 1e-9);
+    }
+
+    #[test]
+    fn along_a_straight_wall_there_is_little_information() {
+        let grid = room_grid();
+        let pose = Pose::new(3.0, 2.0, 0.5);
+        let all = room_scan(pose);
+        // Of the wall at the bottom alone.
+        let end = |point: &[f32; 2]| pose.transform(point.map(f64::from));
+        let wall: Vec<[f32; 2]> = all
+            .iter()
+            .filter(|point| end(point)[1] < 0.25 && (1.0..4.0).contains(&end(point)[0]))
+            .copied()
+            .collect();
+        assert!(wall.len() > 20, "{}", wall.len());
+        let shape = shape_of_information(&grid, &wall, pose);
+        assert!(shape[(0, 0)] < 0.1 && shape[(1, 1)] > 0.99, "{shape}");
+        let whole = shape_of_information(&grid, &all, pose);
+        assert!(whole[(0, 0)] > 0.4 && whole[(1, 1)] > 0.4, "{whole}");
+        assert_eq!(shape_of_information(&grid, &[], pose), Matrix2::identity());
     }
 }

@@ -6,7 +6,7 @@
 //! is why the solver is our own; it needs no crate beyond `nalgebra`.
 
 use maps::Pose;
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::{DMatrix, Matrix2, Matrix3, Vector3};
 
 /// Weights of a constraint: of the distance [1/m] and of the angle [1/rad].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +24,34 @@ pub(crate) struct Relative {
     pub(crate) weights: Weights,
 }
 
+/// A measured pose of a node in the frozen map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct InMap {
+    pub(crate) at: Relative,
+    /// By how much each direction of the map counts: a symmetric matrix with eigenvalues in \[0, 1\].
+    pub(crate) shape: Matrix2<f64>,
+}
+
+impl InMap {
+    fn residual(&self, node: Pose) -> Vector3<f64> {
+        let plain = residual(Pose::IDENTITY, node, self.at.measured, self.at.weights);
+        self.whole_shape() * plain
+    }
+
+    /// The residual, and its derivatives with respect to the node.
+    fn linearize(&self, node: Pose) -> (Vector3<f64>, Matrix3<f64>) {
+        let plain = linearize(Pose::IDENTITY, node, self.at.measured, self.at.weights);
+        let shape = self.whole_shape();
+        (shape * plain.residual, shape * plain.by_to)
+    }
+
+    fn whole_shape(&self) -> Matrix3<f64> {
+        let mut shape = Matrix3::identity();
+        shape.fixed_view_mut::<2, 2>(0, 0).copy_from(&self.shape);
+        shape
+    }
+}
+
 /// A problem of pose adjustment.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Problem {
@@ -34,7 +62,7 @@ pub(crate) struct Problem {
     /// Nodes in submaps, by the submap's index.
     pub(crate) in_submap: Vec<(usize, Relative)>,
     /// Nodes in the frozen map, with robust loss.
-    pub(crate) in_map: Vec<Relative>,
+    pub(crate) in_map: Vec<InMap>,
     /// Weighted residual beyond which the loss is linear (Huber).
     pub(crate) huber_scale: f64,
 }
@@ -160,7 +188,7 @@ impl Problem {
             .in_map
             .iter()
             .map(|at| {
-                let norm = residual(Pose::IDENTITY, self.nodes[at.node], at.measured, at.weights).norm();
+                let norm = at.residual(self.nodes[at.at.node]).norm();
                 if norm <= self.huber_scale {
                     norm * norm
                 } else {
@@ -205,15 +233,15 @@ impl Problem {
             normal.border[at.node].push((*submap, l.by_to.transpose() * l.by_from));
         }
         for at in &self.in_map {
-            let l = linearize(Pose::IDENTITY, self.nodes[at.node], at.measured, at.weights);
-            let norm = l.residual.norm();
+            let (residual, by_node) = at.linearize(self.nodes[at.at.node]);
+            let norm = residual.norm();
             let share = if norm > self.huber_scale {
                 self.huber_scale / norm
             } else {
                 1.0
             };
-            normal.diagonal[at.node] += l.by_to.transpose() * l.by_to * share;
-            normal.gradient[at.node] += l.by_to.transpose() * l.residual * share;
+            normal.diagonal[at.at.node] += by_node.transpose() * by_node * share;
+            normal.gradient[at.at.node] += by_node.transpose() * residual * share;
         }
         normal
     }
@@ -351,11 +379,36 @@ mod tests {
                 })
                 .collect(),
             in_map: [3, 19, 36]
-                .map(|node| relative(node, Pose::IDENTITY, STIFF))
+                .map(|node| in_map(relative(node, Pose::IDENTITY, STIFF)))
                 .to_vec(),
             huber_scale: 10.0,
         };
         (problem, truth)
+    }
+
+    fn in_map(at: Relative) -> InMap {
+        InMap {
+            at,
+            shape: Matrix2::identity(),
+        }
+    }
+
+    #[test]
+    fn a_match_pulls_only_in_the_directions_that_count() {
+        let (mut problem, truth) = known();
+        let measured = |node: usize| Pose::new(truth[node].x + 1.0, truth[node].y, truth[node].heading);
+        for at in &mut problem.in_map {
+            // A straight along x: the match says nothing of x.
+            at.shape = Matrix2::new(0.0, 0.0, 0.0, 1.0);
+            at.at.measured = measured(at.at.node);
+        }
+        problem.solve(100);
+        assert!(worst(&problem.nodes, &truth) < 1e-3);
+        for at in &mut problem.in_map {
+            at.shape = Matrix2::identity();
+        }
+        problem.solve(100);
+        assert!(worst(&problem.nodes, &truth) > 0.9);
     }
 
     fn worst(poses: &[Pose], truth: &[Pose]) -> f64 {
@@ -385,13 +438,15 @@ mod tests {
         let (mut problem, truth) = known();
         problem.in_map = (0..40)
             .step_by(4)
-            .map(|node| Relative {
-                node,
-                measured: truth[node],
-                weights: STIFF,
+            .map(|node| {
+                in_map(Relative {
+                    node,
+                    measured: truth[node],
+                    weights: STIFF,
+                })
             })
             .collect();
-        problem.in_map[5].measured.x += 3.0;
+        problem.in_map[5].at.measured.x += 3.0;
         problem.solve(100);
         assert!(
             worst(&problem.nodes, &truth) < 0.05,

@@ -153,6 +153,12 @@ parameters! {
     /// Frozen submaps that a node is taken to lie in. Cartographer's map is made of submaps that overlap, and each of them
     /// samples the nodes by itself; ours is one grid.
     frozen_submaps_in_reach: usize = 3, 1.0, 100.0, "frozen_submaps_in_reach";
+    /// Whether the local frame stands in the map where the last optimized node says, and not the last submap. A submap's pose
+    /// is a mean over its nodes, which is metres old. Cartographer has no such choice.
+    local_to_global_by_last_node: bool = false, 0.0, 1.0, "local_to_global_by_last_node";
+    /// Whether a match counts in each direction by how well its scan determines it, and not in all alike. Cartographer has no such
+    /// choice.
+    match_weights_by_information: bool = false, 0.0, 1.0, "match_weights_by_information";
     /// Least score of a match around a node's pose, in [0, 1].
     min_score: f64 = 0.55, 0.0, 1.0, "pose_graph.constraint_builder.min_score";
     /// Least score of a match anywhere on the map, in [0, 1].

@@ -53,6 +53,9 @@ const MOST_PENDING: usize = 32;
 /// During a search, a node is matched with the whole map this often \[s\].
 const SEARCH_EVERY: f64 = 0.3;
 
+/// A car that is slower stands [m/s].
+const STANDS: f64 = 0.05;
+
 /// A scan that is older than the pose that was set by more than this is dropped \[s\].
 const LATE: f64 = 0.5;
 
@@ -82,8 +85,9 @@ pub struct PoseGraph {
     /// Number of the work that somebody does elsewhere.
     in_flight: Option<u64>,
     works: u64,
-    /// When a node matched the map last, or the pose was set.
-    connected: Option<Stamp>,
+    /// For how long the car has driven since a node matched the map, or the pose was set \[s\].
+    unmatched: f64,
+    last_node: Option<Stamp>,
     last_search: Option<Stamp>,
     errors: MatchErrors,
     slip: SlipMeter,
@@ -122,7 +126,8 @@ impl PoseGraph {
             wanted: false,
             in_flight: None,
             works: 0,
-            connected: None,
+            unmatched: 0.0,
+            last_node: None,
             last_search: None,
             errors: MatchErrors::default(),
             slip: SlipMeter::default(),
@@ -143,7 +148,8 @@ impl PoseGraph {
         self.in_flight = None;
         self.mode = mode;
         self.errors = errors;
-        self.connected = stamp;
+        self.unmatched = 0.0;
+        self.last_node = stamp;
         self.last_search = None;
         self.slip.clear();
         self.averages = None;
@@ -199,7 +205,7 @@ impl PoseGraph {
             } else {
                 self.errors.add(matched.predicted, matched.found.pose);
             }
-            self.connected = self.last_scan;
+            self.unmatched = 0.0;
         }
     }
 
@@ -207,18 +213,24 @@ impl PoseGraph {
     fn add_node(&mut self, stamp: Stamp, odom: Pose, matched: &LocalMatch) {
         let Some(submaps) = &matched.inserted else { return };
         let parameters = &self.parameters;
+        // A car that stands has few nodes, and its pose does not drift.
+        if let Some((last, pose)) = self.last_node.zip(self.graph.last_local()) {
+            let pause = stamp.since(last);
+            if pose.distance(matched.pose) > STANDS * pause {
+                self.unmatched += pause;
+            }
+        }
+        self.last_node = Some(stamp);
         let (node, global) = self
             .graph
             .add(matched.pose, odom, submaps, parameters.max_submaps_to_keep);
         self.nodes_since_optimization += 1;
-        let connected = self.connected.get_or_insert(stamp);
-        let lost = stamp.since(*connected) > parameters.global_constraint_search_after_n_seconds;
+        let lost = self.unmatched > parameters.global_constraint_search_after_n_seconds;
         let search = match self.mode {
             Mode::Searching => None,
-            _ if lost => self
-                .global_sampler
-                .pulse(parameters.global_sampling_ratio)
-                .then_some(Search::Anywhere),
+            _ if lost && self.global_sampler.pulse(parameters.global_sampling_ratio) => {
+                Some(Search::Anywhere)
+            }
             _ => (0..parameters.frozen_submaps_in_reach)
                 .fold(false, |any, _| {
                     self.sampler.pulse(parameters.sampling_ratio) || any

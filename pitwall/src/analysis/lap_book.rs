@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use protocol::{CauseKind, Covariance, Event, EventKind, Header, Health, Load, Pose, Severity, State};
 
-use super::{Channel, Invalid, LapKind, LapTrace, TrackLine};
+use super::lap_check::{LapCheck, Step};
+use super::{Channel, LapKind, LapTrace, TrackLine};
 
 /// A pose, as far as laps need it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,6 +27,8 @@ pub struct PoseSample {
     pub yaw_rate: f64,
     /// Greatest standard deviation of the position \[m\].
     pub sigma: f64,
+    /// Position in `map` \[m\].
+    pub position: [f64; 2],
 }
 
 impl PoseSample {
@@ -41,6 +44,7 @@ impl PoseSample {
             heading: pose.pose.heading,
             yaw_rate: pose.twist.angular,
             sigma: greatest_sigma(pose.covariance),
+            position: [pose.pose.x, pose.pose.y],
         })
     }
 }
@@ -73,6 +77,8 @@ pub struct LapBook {
     /// Laps begun here.
     count: u64,
     pose: Option<Sample<4>>,
+    /// The newest pose as it came.
+    last: Option<PoseSample>,
     health: Option<Sample<9>>,
     update_ms: Option<f32>,
     sigma: Option<f32>,
@@ -85,19 +91,14 @@ pub struct LapBook {
 struct OpenLap {
     trace: LapTrace,
     whole: bool,
-    stopped_since: Option<i64>,
-    invalid: Option<Invalid>,
+    check: LapCheck,
 }
 
 impl LapBook {
     /// Most laps kept.
     pub const MAX_LAPS: usize = 500;
-    /// A longer time between two poses is a gap \[ns\].
-    const GAP: i64 = 1_000_000_000;
-    /// A car slower than this stands \[m/s\].
-    const STANDS: f64 = 0.2;
-    /// A whole lap of which less is known does not count.
-    const KNOWN: f64 = 0.97;
+    /// A longer time between two messages is a gap \[ns\].
+    const GAP: i64 = Step::GAP;
 
     #[cfg(test)]
     pub(super) fn of_lap(lap: LapTrace) -> Self {
@@ -114,7 +115,7 @@ impl LapBook {
         }
         self.line = Some(line);
         self.open = None;
-        (self.pose, self.health) = (None, None);
+        (self.pose, self.last, self.health) = (None, None, None);
     }
 
     /// The line that the car drives along.
@@ -200,31 +201,31 @@ impl LapBook {
         let sigma = pose.sigma as f32;
         self.sigma = Some(sigma);
         self.pose = Some(here);
-        self.watch(pose, before.as_ref());
+        let last = self.last.replace(*pose);
+        if let Some(open) = &mut self.open {
+            open.check.on_pose(last.as_ref(), pose);
+        }
         if self.open.is_none() {
             self.begin(pose.lap, pose.at, LapKind::Out, &line);
         }
         let Some(mut before) = before else { return };
-        let mut ahead = pose.s - before.s;
-        let crossed = ahead < -length / 2.0;
-        if crossed {
-            ahead += length;
-        }
-        let step = pose.at - before.at;
-        if step > Self::GAP || ahead <= 0.0 || ahead > length / 4.0 {
+        let Some(step) = last.and_then(|last| Step::between(&last, pose, length)) else {
             // A lap that the car counted without being seen at the line.
+            let crossed = pose.s - before.s < -length / 2.0;
             if self.open.as_ref().is_some_and(|open| open.trace.lap != pose.lap)
-                && (crossed || step > Self::GAP)
+                && (crossed || pose.at - before.at > Self::GAP)
             {
                 self.end();
                 self.begin(pose.lap, pose.at, LapKind::Out, &line);
             }
             return;
+        };
+        if let Some(open) = &mut self.open {
+            open.check.on_step(&step, length, false);
         }
-        let end = before.s + ahead;
-        if crossed {
-            let share = (length - before.s) / ahead;
-            let line_at = before.at + (share * step as f64) as i64;
+        if step.over_line {
+            let line_at = step.when(length).unwrap_or(pose.at);
+            let share = (line_at - before.at) as f64 / (pose.at - before.at) as f64;
             let mut on_line = here;
             on_line.at = line_at;
             on_line.s = length;
@@ -234,38 +235,14 @@ impl LapBook {
             self.fill_pose(&before, &on_line, sigma);
             self.close();
             self.begin(pose.lap, line_at, LapKind::Flying, &line);
+            if let Some(open) = &mut self.open {
+                open.check.on_step(&step, length, true);
+            }
             on_line.s = 0.0;
             before = on_line;
-            let here = Sample {
-                s: end - length,
-                ..here
-            };
             self.fill_pose(&before, &here, sigma);
         } else {
             self.fill_pose(&before, &here, sigma);
-        }
-    }
-
-    /// Notes what makes a lap invalid.
-    fn watch(&mut self, pose: &PoseSample, before: Option<&Sample<4>>) {
-        let length = self.line.as_ref().map_or(0.0, |line| line.length);
-        let Some(open) = &mut self.open else { return };
-        if pose.speed < Self::STANDS {
-            let since = *open.stopped_since.get_or_insert(pose.at);
-            if pose.at - since > Self::GAP {
-                open.invalid.get_or_insert(Invalid::Stopped);
-            }
-        } else {
-            open.stopped_since = None;
-        }
-        let Some(before) = before else { return };
-        let step = (pose.at - before.at) as f64 * 1e-9;
-        let mut moved = (pose.s - before.s).abs();
-        moved = moved.min(length - moved);
-        if step > 1.0 {
-            open.invalid.get_or_insert(Invalid::Gap);
-        } else if moved > 1.0 + 30.0 * step {
-            open.invalid.get_or_insert(Invalid::Jumped);
         }
     }
 
@@ -279,8 +256,7 @@ impl LapBook {
         self.open = Some(OpenLap {
             trace,
             whole,
-            stopped_since: None,
-            invalid: None,
+            check: LapCheck::default(),
         });
     }
 
@@ -288,13 +264,10 @@ impl LapBook {
     fn close(&mut self) {
         let Some(open) = self.open.take() else { return };
         let mut trace = open.trace;
-        if open.whole {
-            let invalid = open
-                .invalid
-                .or((trace.covered() < Self::KNOWN).then_some(Invalid::Gap));
-            if let Some(reason) = invalid {
-                trace.kind = LapKind::Invalid(reason);
-            }
+        if open.whole
+            && let Some(reason) = open.check.verdict(trace.line.length)
+        {
+            trace.kind = LapKind::Invalid(reason);
         }
         self.keep(trace);
         self.closing = true;
@@ -347,9 +320,8 @@ impl LapBook {
 
     /// Adds a health message, at the place of the newest pose.
     pub fn on_health(&mut self, at: i64, health: &Health) {
-        let lost = matches!(health.state, State::Lost | State::Relocalizing);
-        if lost && let Some(open) = &mut self.open {
-            open.invalid.get_or_insert(Invalid::Lost);
+        if let Some(open) = &mut self.open {
+            open.check.on_state(health.state);
         }
         let (Some(line), Some(pose), Some(metrics)) = (&self.line, self.pose, &health.metrics) else {
             return;
@@ -420,22 +392,16 @@ impl LapBook {
 
     /// Adds an event.
     pub fn on_event(&mut self, event: &Event) {
-        match &event.kind {
-            EventKind::Lap { lap, time, set } => {
-                if let Some(open) = self.open.as_mut().filter(|open| open.trace.lap == *lap) {
-                    // The event comes before the first pose of the next lap.
-                    open.trace.finish(*time, set);
-                } else if let Some(trace) = self.laps.iter_mut().rev().take(3).find(|trace| trace.lap == *lap)
-                {
-                    Arc::make_mut(trace).finish(*time, set);
-                }
+        if let Some(open) = &mut self.open {
+            open.check.on_event(&event.kind);
+        }
+        if let EventKind::Lap { lap, time, set } = &event.kind {
+            if let Some(open) = self.open.as_mut().filter(|open| open.trace.lap == *lap) {
+                // The event comes before the first pose of the next lap.
+                open.trace.finish(*time, set);
+            } else if let Some(trace) = self.laps.iter_mut().rev().take(3).find(|trace| trace.lap == *lap) {
+                Arc::make_mut(trace).finish(*time, set);
             }
-            EventKind::PoseInitialized { .. } | EventKind::Relocalized { .. } => {
-                if let Some(open) = &mut self.open {
-                    open.invalid.get_or_insert(Invalid::PoseGiven);
-                }
-            }
-            _ => {}
         }
     }
 }
@@ -466,6 +432,7 @@ fn fill_health(trace: &mut LapTrace, from: &Sample<9>, to: &Sample<9>, causes: &
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::Invalid;
     use super::super::track_line::tests::ring;
     use super::*;
     use protocol::{Cause, Metrics};
@@ -490,6 +457,7 @@ pub(super) mod tests {
                 heading: maps::wrap_angle(s / 3.0 + TAU / 4.0 + 0.05),
                 yaw_rate: v / 3.0,
                 sigma: 0.02,
+                position: [3.0 * (s / 3.0).cos(), 3.0 * (s / 3.0).sin()],
             });
             if tick.is_multiple_of(4) {
                 let slips = (5.0..7.0).contains(&s);
@@ -632,6 +600,7 @@ pub(super) mod tests {
             heading: 0.0,
             yaw_rate: 0.0,
             sigma: 0.0,
+            position: [0.0; 2],
         };
         book.on_pose(&far);
         book.end();
@@ -654,6 +623,7 @@ pub(super) mod tests {
                 heading: 0.0,
                 yaw_rate: 0.0,
                 sigma: 0.0,
+                position: [0.0; 2],
             };
             book.on_pose(&pose);
             pose.at = 0;

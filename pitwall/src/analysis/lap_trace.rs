@@ -56,11 +56,13 @@ pub enum LapKind {
 pub enum Invalid {
     /// The car stood still for a second or more.
     Stopped,
-    /// A pose was given or searched for on the way.
+    /// A pose was given on the way.
     PoseGiven,
+    /// The pose was searched for and found on the way.
+    PoseFound,
     /// The pose was wrong or unknown on the way.
     Lost,
-    /// The pose jumped along the track.
+    /// The pose jumped.
     Jumped,
     /// Part of the lap is missing.
     Gap,
@@ -72,6 +74,7 @@ impl Invalid {
         match self {
             Self::Stopped => "the car stood still",
             Self::PoseGiven => "a pose was given",
+            Self::PoseFound => "the pose was searched for",
             Self::Lost => "localization was lost",
             Self::Jumped => "the pose jumped",
             Self::Gap => "part of the lap is missing",

@@ -11,6 +11,7 @@
 mod advice;
 mod channel;
 mod lap_book;
+mod lap_check;
 mod lap_trace;
 mod map_check;
 mod sectors;
@@ -21,6 +22,7 @@ mod view;
 pub use channel::Channel;
 pub(crate) use channel::Worse;
 pub use lap_book::{LapBook, PoseSample};
+pub(crate) use lap_check::{LapCheck, Step};
 pub use lap_trace::{Invalid, LapKind, LapTrace};
 pub use map_check::{Disagreement, MapCheck, MapFinding};
 pub use sectors::{Sectors, ideal_lap};

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::{
-    CarInfo, CarName, Cloud, Event, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params,
-    Pose, ScanView, Severity, Shadow, State, Telemetry, Topic, Truth,
+    CarInfo, CarName, Cloud, EventKind, Header, Health, LinkReport, Load, MapReply, Message, Params, Pose,
+    ScanView, Severity, Shadow, State, Telemetry, Topic, Truth,
 };
 
 use crate::analysis::{LapBook, MapCheck, PoseSample, TrackLine};
@@ -14,7 +14,7 @@ use crate::recording::missing_content;
 
 use super::clock_estimate::ClockEstimate;
 use super::history::{HealthHistory, HealthProfile, HealthSample, ProfileCell};
-use super::laps::{Lap, LapTimer, TrackPose};
+use super::laps::{Lap, LapTimer};
 use super::limits::{LimitWatch, Limits};
 use super::log::LogEntry;
 use super::stream_statistics::{Freshness, StreamStatistics};
@@ -147,20 +147,13 @@ impl Car {
             Telemetry::Pose(pose) => {
                 self.pose = Some((*header, *pose));
                 if let Some(sample) = PoseSample::of(header, pose) {
+                    if let Some(length) = self.lap_length() {
+                        self.laps.on_pose(&sample, length);
+                    }
                     self.book.on_pose(&sample);
                     if let Some(check) = &mut self.map_check {
                         check.on_pose(sample.s, header.sensor);
                     }
-                }
-                if let (Some(track), Some(length)) = (pose.track, self.lap_length()) {
-                    let here = TrackPose {
-                        at: header.sensor,
-                        s: track.s,
-                        d: track.d,
-                        position: [pose.pose.x, pose.pose.y],
-                        lap: pose.lap,
-                    };
-                    self.laps.on_pose(here, length);
                 }
             }
             Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
@@ -176,9 +169,7 @@ impl Car {
             Telemetry::Health(health) => {
                 self.history.add(at, health);
                 self.book.on_health(header.sensor, health);
-                if let Some(metrics) = &health.metrics {
-                    self.laps.on_metrics(metrics);
-                }
+                self.laps.on_health(health);
                 let s = self.pose.and_then(|(_, pose)| Some(pose.track?.s));
                 if let (Some(s), Some(length)) = (s, self.lap_length()) {
                     self.health_profile.add(s, length, health);
@@ -198,25 +189,12 @@ impl Car {
                     && since.is_some_and(|since| header.sensor < *since);
                 if !ended_before {
                     self.book.on_event(event);
-                    self.on_event(event);
+                    self.laps.on_event(&event.kind);
                 }
             }
             Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
         }
         true
-    }
-
-    fn on_event(&mut self, event: &Event) {
-        match &event.kind {
-            EventKind::Lap {
-                lap,
-                time: Some(time),
-                set,
-            } => self.laps.on_lap(*lap, *time, set),
-            EventKind::PoseInitialized { .. } => self.laps.make_void("a pose was given"),
-            EventKind::Relocalized { .. } => self.laps.make_void("the pose was searched for"),
-            _ => {}
-        }
     }
 
     /// True when the messages of a topic are shown: for poses and health, the live or the full-rate ones.
@@ -286,6 +264,11 @@ impl Car {
     /// Laps driven, the last 500.
     pub fn laps(&self) -> &[Lap] {
         self.laps.laps()
+    }
+
+    /// Changes whenever the laps do.
+    pub(crate) fn lap_changes(&self) -> u64 {
+        self.laps.changes()
     }
 
     /// The last two minutes of health, the oldest first.

@@ -5,8 +5,10 @@
 
 use std::collections::VecDeque;
 
-use protocol::Metrics;
+use protocol::{EventKind, Health, Metrics};
 use serde::Serialize;
+
+use crate::analysis::{Invalid, LapCheck, PoseSample, Step};
 
 /// Sectors of a lap, of equal length along the raceline.
 pub const SECTORS: usize = 3;
@@ -18,7 +20,7 @@ pub struct Lap {
     pub lap: u32,
     /// Its time \[s\].
     pub time_s: f64,
-    /// Why the time does not count; None for a good lap.
+    /// Why it is void, so that its time does not count; None for a good lap.
     pub void: Option<&'static str>,
     /// The set in force at its end.
     pub set: String,
@@ -52,33 +54,24 @@ pub(crate) struct LapTimer {
     laps: Vec<Lap>,
     /// Laps that have not ended yet or just have, the newest last.
     traces: VecDeque<Trace>,
-    last: Option<TrackPose>,
-}
-
-/// A pose on the raceline.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct TrackPose {
-    /// When it was true \[unix ns\].
-    pub(crate) at: i64,
-    /// Arc length on the raceline \[m\].
-    pub(crate) s: f64,
-    /// Distance from the raceline \[m\].
-    pub(crate) d: f64,
-    /// Position in the map \[m\].
-    pub(crate) position: [f64; 2],
-    /// Laps begun.
-    pub(crate) lap: u32,
+    last: Option<PoseSample>,
+    /// Changes with the laps.
+    changes: u64,
 }
 
 /// Data of a lap that has not ended.
 #[derive(Debug, Clone, Default)]
 struct Trace {
     lap: u32,
-    void: Option<&'static str>,
+    check: LapCheck,
     /// When it started \[unix ns\]; None if the start was missed.
     begun: Option<i64>,
     /// When each border between two sectors was passed \[unix ns\].
     borders: [Option<i64>; SECTORS - 1],
+    /// True when the next lap has begun.
+    ended: bool,
+    /// Length of a lap \[m\].
+    length: f64,
     poses: u32,
     lateral: f64,
     healths: u32,
@@ -92,46 +85,58 @@ impl LapTimer {
     const MAX_LAPS: usize = 500;
     /// Maximum number of laps whose end is not reported yet.
     const MAX_TRACES: usize = 4;
-    /// A longer time between two poses is a gap \[ns\].
-    const GAP: i64 = 1_000_000_000;
-    /// Two poses that are further apart than this speed allows are a jump \[m/s\]. No car of this class is that fast.
-    const FASTEST: f64 = 25.0;
-    /// How far a pose may move beyond that \[m\].
-    const LOOSE: f64 = 0.5;
 
     pub(crate) fn laps(&self) -> &[Lap] {
         &self.laps
     }
 
+    /// Changes whenever the laps do.
+    pub(crate) fn changes(&self) -> u64 {
+        self.changes
+    }
+
     /// Adds a pose on a raceline of `length` \[m\].
-    pub(crate) fn on_pose(&mut self, here: TrackPose, length: f64) {
-        let before = self.last.replace(here);
-        let jumped = before.is_some_and(|before| before.jumps_to(here));
+    pub(crate) fn on_pose(&mut self, here: &PoseSample, length: f64) {
+        if self.last.is_some_and(|last| last.at >= here.at) {
+            return;
+        }
+        let before = self.last.replace(*here);
         // A car that restarts counts its laps from the beginning.
         if self.traces.back().is_some_and(|trace| trace.lap > here.lap) {
             self.traces.clear();
         }
-        let step = before.and_then(|before| Step::between(before, here, length));
+        if let Some(trace) = self.traces.back_mut() {
+            trace.check.on_pose(before.as_ref(), here);
+        }
+        let step = before.and_then(|before| Step::between(&before, here, length));
         if self.traces.back().is_none_or(|trace| trace.lap != here.lap) {
+            if let (Some(trace), Some(step)) = (self.traces.back_mut(), step) {
+                trace.check.on_step(&step, length, false);
+            }
+            self.close(length);
             if self.traces.len() == Self::MAX_TRACES {
                 self.traces.pop_front();
             }
-            self.traces.push_back(Trace {
+            let mut trace = Trace {
                 lap: here.lap,
                 begun: step
                     .filter(|step| step.over_line)
                     .and_then(|step| step.when(length)),
                 ..Trace::default()
-            });
+            };
+            if let Some(step) = step {
+                trace.check.on_step(&step, length, true);
+            }
+            self.traces.push_back(trace);
+        } else if let (Some(trace), Some(step)) = (self.traces.back_mut(), step) {
+            trace.check.on_step(&step, length, false);
         }
         let Some(trace) = self.traces.back_mut() else {
             return;
         };
-        if jumped {
-            trace.void = Some("the pose has jumped");
-        }
+        trace.length = length;
         trace.poses += 1;
-        trace.lateral += here.d.abs();
+        trace.lateral += here.lateral.abs();
         if let Some(step) = step {
             for (i, border) in trace.borders.iter_mut().enumerate() {
                 let at = length * (i + 1) as f64 / SECTORS as f64;
@@ -144,10 +149,34 @@ impl LapTimer {
         }
     }
 
-    /// Makes the present lap void: its time does not count.
-    pub(crate) fn make_void(&mut self, why: &'static str) {
-        if let Some(trace) = self.traces.back_mut() {
-            trace.void = Some(why);
+    /// The newest lap has ended: now all is known of it. Its time may have been reported before.
+    fn close(&mut self, length: f64) {
+        let Some(trace) = self.traces.back_mut() else {
+            return;
+        };
+        (trace.ended, trace.length) = (true, length);
+        let void = trace.void().map(Invalid::words);
+        let reported = self.laps.iter_mut().rev().take(Self::MAX_TRACES);
+        if let Some(lap) = reported
+            .into_iter()
+            .find(|lap| lap.lap == trace.lap && lap.void != void)
+        {
+            lap.void = void;
+            self.changes += 1;
+        }
+    }
+
+    /// Adds an event.
+    pub(crate) fn on_event(&mut self, event: &EventKind) {
+        if let EventKind::Lap {
+            lap,
+            time: Some(time),
+            set,
+        } = event
+        {
+            self.on_lap(*lap, *time, set);
+        } else if let Some(trace) = self.traces.back_mut() {
+            trace.check.on_event(event);
         }
     }
 
@@ -157,18 +186,16 @@ impl LapTimer {
         good.map(|lap| lap.time_s).min_by(f64::total_cmp)
     }
 
-    /// Takes in what was measured just now.
-    pub(crate) fn on_metrics(&mut self, metrics: &Metrics) {
+    /// Adds a health message.
+    pub(crate) fn on_health(&mut self, health: &Health) {
         if let Some(trace) = self.traces.back_mut() {
-            trace.healths += 1;
-            trace.slipping += u32::from(metrics.slip.abs() > LapGrip::SLIPS);
-            trace.worst_slip = trace.worst_slip.max(metrics.slip.abs());
-            trace.alignment += f64::from(metrics.alignment);
+            trace.check.on_state(health.state);
+            trace.measure(health.metrics.as_ref());
         }
     }
 
     /// Adds a completed lap.
-    pub(crate) fn on_lap(&mut self, lap: u32, time_s: f64, set: &str) {
+    fn on_lap(&mut self, lap: u32, time_s: f64, set: &str) {
         let at = self.traces.iter().position(|trace| trace.lap == lap);
         let trace = at.map(|at| &self.traces[at]);
         // The event may arrive before the first pose of the next lap.
@@ -193,10 +220,14 @@ impl LapTimer {
         if self.laps.len() == Self::MAX_LAPS {
             self.laps.remove(0);
         }
+        self.changes += 1;
         self.laps.push(Lap {
             lap,
             time_s,
-            void: trace.and_then(|trace| trace.void),
+            // Without a raceline there is no trace of any lap, and nothing to judge by.
+            void: trace
+                .map_or_else(|| (!self.traces.is_empty()).then_some(Invalid::Gap), Trace::void)
+                .map(Invalid::words),
             set: set.to_owned(),
             sectors_s,
             grip: trace.and_then(Trace::grip),
@@ -207,15 +238,25 @@ impl LapTimer {
     }
 }
 
-impl TrackPose {
-    fn jumps_to(self, here: Self) -> bool {
-        let seconds = (here.at - self.at).max(0) as f64 * 1e-9;
-        let [dx, dy] = [0, 1].map(|i| here.position[i] - self.position[i]);
-        dx.hypot(dy) > LapTimer::FASTEST * seconds + LapTimer::LOOSE
-    }
-}
-
 impl Trace {
+    /// Why it is void, as far as is known.
+    fn void(&self) -> Option<Invalid> {
+        let found = if self.ended {
+            self.check.verdict(self.length)
+        } else {
+            self.check.so_far()
+        };
+        found.or(self.begun.is_none().then_some(Invalid::Gap))
+    }
+
+    fn measure(&mut self, metrics: Option<&Metrics>) {
+        let Some(metrics) = metrics else { return };
+        self.healths += 1;
+        self.slipping += u32::from(metrics.slip.abs() > LapGrip::SLIPS);
+        self.worst_slip = self.worst_slip.max(metrics.slip.abs());
+        self.alignment += f64::from(metrics.alignment);
+    }
+
     fn grip(&self) -> Option<LapGrip> {
         let share = |sum: f64| sum / f64::from(self.healths);
         (self.healths > 0).then(|| LapGrip {
@@ -226,42 +267,10 @@ impl Trace {
     }
 }
 
-/// From one pose to the next, forwards.
-#[derive(Debug, Clone, Copy)]
-struct Step {
-    from: (i64, f64),
-    /// `s` here may exceed a lap's length.
-    to: (i64, f64),
-    over_line: bool,
-}
-
-impl Step {
-    /// None for a jump, a pause, and for driving backwards.
-    fn between(before: TrackPose, here: TrackPose, length: f64) -> Option<Self> {
-        let mut ahead = here.s - before.s;
-        let over_line = ahead < -length / 2.0;
-        if over_line {
-            ahead += length;
-        }
-        let in_time = (1..=LapTimer::GAP).contains(&(here.at - before.at));
-        (in_time && ahead > 0.0 && ahead < length / 4.0).then_some(Self {
-            from: (before.at, before.s),
-            to: (here.at, before.s + ahead),
-            over_line,
-        })
-    }
-
-    /// When `s` was passed \[unix ns\]; None if it was not.
-    fn when(&self, s: f64) -> Option<i64> {
-        let (from, to) = (self.from, self.to);
-        (from.1 < s && s <= to.1)
-            .then(|| from.0 + ((s - from.1) / (to.1 - from.1) * (to.0 - from.0) as f64) as i64)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::{Pose2, State};
 
     const LENGTH: f64 = 30.0;
 
@@ -269,7 +278,7 @@ mod tests {
     fn drive(timer: &mut LapTimer, laps: u32) {
         let (mut s, mut at, mut lap) = (29.0, 0, 0);
         while lap < laps + 1 {
-            timer.on_pose(on_ring(at, s, lap), LENGTH);
+            timer.on_pose(&on_ring(at, s, lap), LENGTH);
             let speed = [5.0, 10.0, 2.5][(s / 10.0) as usize % SECTORS];
             s += speed / 40.0;
             at += 25_000_000;
@@ -278,14 +287,22 @@ mod tests {
                 lap += 1;
             }
         }
-        timer.on_pose(on_ring(at, s, lap), LENGTH);
+        timer.on_pose(&on_ring(at, s, lap), LENGTH);
+    }
+
+    fn on_lap(timer: &mut LapTimer, lap: u32, time_s: f64, set: &str) {
+        timer.on_event(&EventKind::Lap {
+            lap,
+            time: Some(time_s),
+            set: set.into(),
+        });
     }
 
     #[test]
     fn sectors_add_up_to_the_lap() {
         let mut timer = LapTimer::default();
         drive(&mut timer, 2);
-        timer.on_lap(2, 7.0, "hq");
+        on_lap(&mut timer, 2, 7.0, "hq");
         let lap = &timer.laps()[0];
         let sectors: Vec<f64> = lap.sectors_s.iter().map(|s| s.expect("driven")).collect();
         // Speeds change with the pose after a border: half a step, or 12.5 ms, to either side.
@@ -294,7 +311,7 @@ mod tests {
         }
         assert!((sectors.iter().sum::<f64>() - 7.0).abs() < 0.03, "{sectors:?}");
         assert!(lap.lateral_m.is_some_and(|d| (d - 0.1).abs() < 1e-9));
-        assert_eq!(lap.grip, None);
+        assert_eq!((lap.grip, lap.void), (None, None));
     }
 
     #[test]
@@ -303,25 +320,29 @@ mod tests {
         drive(&mut timer, 1);
         let begun_two = timer.traces.back().expect("a lap").lap;
         timer.traces.pop_back();
-        timer.on_lap(begun_two - 1, 7.0, "hq");
+        on_lap(&mut timer, begun_two - 1, 7.0, "hq");
         assert!(timer.laps()[0].sectors_s.iter().all(Option::is_some));
     }
 
     /// A ring of this length.
-    fn on_ring(at: i64, s: f64, lap: u32) -> TrackPose {
+    fn on_ring(at: i64, s: f64, lap: u32) -> PoseSample {
         let (sin, cos) = (s / LENGTH * std::f64::consts::TAU).sin_cos();
         let radius = LENGTH / std::f64::consts::TAU;
-        TrackPose {
+        PoseSample {
             at,
             s,
-            d: -0.1,
-            position: [radius * cos, radius * sin],
             lap,
+            speed: 5.0,
+            lateral: -0.1,
+            heading: 0.0,
+            yaw_rate: 0.0,
+            sigma: 0.0,
+            position: [radius * cos, radius * sin],
         }
     }
 
     /// In the first lap.
-    fn passed(at: i64, s: f64) -> TrackPose {
+    fn passed(at: i64, s: f64) -> PoseSample {
         on_ring(at, s, 1)
     }
 
@@ -330,44 +351,107 @@ mod tests {
     fn a_lap_with_a_jump_or_a_given_pose_is_void_and_never_the_best() {
         let mut timer = LapTimer::default();
         drive(&mut timer, 1);
-        timer.on_lap(1, 7.0, "hq");
-        timer.on_pose(on_ring(20_000_000_000, 15.0, 2), LENGTH);
-        timer.on_pose(on_ring(20_025_000_000, 25.0, 2), LENGTH);
-        timer.on_lap(2, 3.5, "hq");
-        timer.on_pose(on_ring(20_050_000_000, 25.1, 3), LENGTH);
-        timer.make_void("a pose was given");
-        timer.on_lap(3, 3.0, "hq");
+        on_lap(&mut timer, 1, 7.0, "hq");
+        let pose = |at: i64, s, lap| on_ring(8_000_000_000 + at, s, lap);
+        timer.on_pose(&pose(0, 15.0, 2), LENGTH);
+        timer.on_pose(&pose(25_000_000, 25.0, 2), LENGTH);
+        on_lap(&mut timer, 2, 3.5, "hq");
+        timer.on_pose(&pose(50_000_000, 25.1, 3), LENGTH);
+        let given = Pose2 {
+            x: 0.0,
+            y: 0.0,
+            heading: 0.0,
+        };
+        timer.on_event(&EventKind::PoseInitialized {
+            before: None,
+            pose: given,
+        });
+        on_lap(&mut timer, 3, 3.0, "hq");
         let void: Vec<_> = timer.laps().iter().map(|lap| lap.void).collect();
-        assert_eq!(
-            void,
-            [None, Some("the pose has jumped"), Some("a pose was given")]
-        );
+        assert_eq!(void, [None, Some("the pose jumped"), Some("a pose was given")]);
         assert_eq!(LapTimer::best(timer.laps()), Some(7.0));
+    }
+
+    /// The page counted laps that the report left out.
+    #[test]
+    fn a_lap_in_which_the_car_stood_or_was_lost_or_that_was_not_seen_is_void() {
+        let mut timer = LapTimer::default();
+        drive(&mut timer, 1);
+        on_lap(&mut timer, 1, 7.0, "hq");
+        let begun = timer.last.expect("a pose").at;
+        for i in 1..60 {
+            let mut here = on_ring(begun + i * 25_000_000, 0.3, 2);
+            here.speed = 0.0;
+            timer.on_pose(&here, LENGTH);
+        }
+        on_lap(&mut timer, 2, 9.0, "hq");
+        assert_eq!(timer.laps()[1].void, Some("the car stood still"));
+
+        let lost = Health {
+            state: State::Lost,
+            since: 0,
+            causes: Vec::new(),
+            update: 1,
+            metrics: None,
+            proposal: None,
+            auto: false,
+        };
+        timer.on_pose(&on_ring(begun + 60 * 25_000_000, 0.1, 3), LENGTH);
+        timer.on_health(&lost);
+        on_lap(&mut timer, 3, 9.0, "hq");
+        assert!(timer.laps()[2].void.is_some());
+
+        // The news of a lap comes before its last pose: that too little was seen of it is known only with the next one.
+        let mut timer = LapTimer::default();
+        drive(&mut timer, 1);
+        let begun = timer.last.expect("a pose").at;
+        for i in 1..10 {
+            timer.on_pose(&on_ring(begun + i * 25_000_000, 0.1 * i as f64, 2), LENGTH);
+        }
+        // A quarter of the lap is not seen, within less than a second.
+        let (mut at, mut s) = (begun + 1_000_000_000, 9.0);
+        while s < LENGTH - 0.2 {
+            timer.on_pose(&on_ring(at, s, 2), LENGTH);
+            (at, s) = (at + 25_000_000, s + 0.25);
+        }
+        on_lap(&mut timer, 2, 9.0, "hq");
+        let changes = timer.changes();
+        assert_eq!(timer.laps()[0].void, None);
+        timer.on_pose(&on_ring(at, 0.1, 3), LENGTH);
+        assert_eq!(timer.laps()[0].void, Some("part of the lap is missing"));
+        assert!(timer.changes() > changes, "the page asks for the laps again");
     }
 
     #[test]
     fn a_jump_passes_no_border() {
         let mut timer = LapTimer::default();
-        timer.on_pose(passed(0, 5.0), LENGTH);
-        timer.on_pose(passed(25_000_000, 15.0), LENGTH);
-        timer.on_pose(passed(9_000_000_000, 16.0), LENGTH);
-        timer.on_lap(1, 9.0, "lq");
+        timer.on_pose(&passed(0, 5.0), LENGTH);
+        timer.on_pose(&passed(25_000_000, 15.0), LENGTH);
+        timer.on_pose(&passed(9_000_000_000, 16.0), LENGTH);
+        on_lap(&mut timer, 1, 9.0, "lq");
         assert_eq!(timer.laps()[0].sectors_s, [None; SECTORS]);
     }
 
     #[test]
     fn slip_is_told_as_a_share_of_the_lap() {
         let mut timer = LapTimer::default();
-        timer.on_pose(passed(0, 5.0), LENGTH);
+        timer.on_pose(&passed(0, 5.0), LENGTH);
         for slip in [0.0, 0.05, -0.3, 0.1] {
-            let alignment = 0.8;
-            timer.on_metrics(&Metrics {
-                slip,
-                alignment,
-                ..Metrics::default()
+            timer.on_health(&Health {
+                state: State::Localized,
+                since: 0,
+                causes: Vec::new(),
+                update: 1,
+                metrics: Some(Metrics {
+                    slip,
+                    alignment: 0.8,
+                    ..Metrics::default()
+                }),
+                proposal: None,
+                auto: false,
             });
         }
-        timer.on_lap(1, 9.0, "lq");
+        on_lap(&mut timer, 1, 9.0, "lq");
         let grip = timer.laps()[0].grip.expect("known");
         assert!((grip.slipping - 0.5).abs() < 1e-9 && (grip.worst_slip - 0.3).abs() < 1e-6);
         assert!((grip.alignment - 0.8).abs() < 1e-6);

@@ -115,11 +115,9 @@ fn along(
 }
 
 fn laps(car: &CarReport) -> Option<(String, String)> {
-    let kinds = car.kinds();
-    let counted = |i: usize| kinds.get(i).is_none_or(Option::is_none);
-    let good: Vec<f64> = (car.laps.iter().enumerate())
-        .filter(|(i, _)| counted(*i))
-        .map(|(_, lap)| lap.time_s)
+    let good: Vec<f64> = (car.laps.iter())
+        .filter(|lap| lap.void.is_none())
+        .map(|lap| lap.time_s)
         .collect();
     let all: Vec<f64> = car.laps.iter().map(|lap| lap.time_s).collect();
     let mut times = if good.is_empty() { all } else { good };
@@ -139,14 +137,15 @@ fn laps(car: &CarReport) -> Option<(String, String)> {
     plot.limit(median);
     plot.dots(
         "lap time [s]",
-        car.laps.iter().enumerate().map(|(i, lap)| {
-            let reason = kinds.get(i).copied().flatten();
-            let class = match reason {
+        car.laps.iter().map(|lap| {
+            let class = match lap.void {
                 Some(_) => "hollow",
                 None if lap.time_s <= best => "best",
                 None => "main-dot",
             };
-            let why = reason.map_or_else(String::new, |reason| format!(", does not count: {reason}"));
+            let why = lap
+                .void
+                .map_or_else(String::new, |reason| format!(", does not count: {reason}"));
             let title = format!("lap {}: {:.3} s on {}{why}", lap.lap, lap.time_s, lap.set);
             (class, [f64::from(lap.lap), lap.time_s], title)
         }),

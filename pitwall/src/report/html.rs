@@ -67,7 +67,7 @@ pub(super) fn page(report: &Report) -> String {
 
 /// The paper's table I, from this recording.
 fn table_one(report: &Report) -> String {
-    let mut text = "<h2>Laps by set</h2><div class=\"wide\"><table><tr><th>car, set</th><th>laps</th><th>left out</th><th>lap time: median [s]</th><th>middle half [s]</th><th>mean of all [s]</th>\
+    let mut text = "<h2>Laps by set</h2><div class=\"wide\"><table><tr><th>car, set</th><th>laps</th><th>void</th><th>lap time: median [s]</th><th>middle half [s]</th><th>mean [s]</th>\
                     <th>distance from the line [cm]</th><th>alignment [%]</th><th>CPU [% of a core]</th></tr>"
         .to_owned();
     let mut rows = 0;
@@ -96,8 +96,8 @@ fn table_one(report: &Report) -> String {
         }
     }
     text.push_str(
-        "</table></div><p>Median and middle half are those of the laps that count: in which the car did not stand still, was not given a pose, \
-                    was not lost and did not jump. Means ± standard deviations are those of all laps, as in the paper. Distances are those of the car's own estimate, as in table I of \
+        "</table></div><p>Void laps are left out of every figure: laps in which the car stood still, was given a pose, was lost or jumped, or of which part is \
+                    missing. A set without other laps shows them. Means are given with their standard deviations. Distances are those of the car's own estimate, as in table I of \
                     <i>Robustness Evaluation of Localization Techniques for Autonomous Racing</i> (arXiv 2401.07658).</p>",
     );
     if rows == 0 {
@@ -224,13 +224,12 @@ fn laps(car: &CarReport) -> String {
     };
     let best = least(&|lap| lap.void.is_none().then_some(lap.time_s));
     let sectors: Vec<_> = (0..SECTORS)
-        .map(|i| least(&move |lap| lap.sectors_s[i]))
+        .map(|i| least(&move |lap| lap.sectors_s[i].filter(|_| lap.void.is_none())))
         .collect();
-    let kinds = car.kinds();
     let mut text = "<h3>Laps</h3><div class=\"wide\"><table><tr><th>lap</th><th>time [s]</th><th>to best</th><th>S1</th><th>S2</th><th>S3</th><th>set</th>\
-                    <th>slipping [%]</th><th>alignment [%]</th><th>off the line [cm]</th><th>does not count</th></tr>"
+                    <th>slipping [%]</th><th>alignment [%]</th><th>off the line [cm]</th><th>void because</th></tr>"
         .to_owned();
-    for (i, lap) in car.laps.iter().enumerate() {
+    for lap in &car.laps {
         let time = |value: Option<f64>, best: Option<f64>| {
             let class = if value.is_some() && value == best {
                 " class=\"best\""
@@ -250,15 +249,12 @@ fn laps(car: &CarReport) -> String {
             or_dash(lap.grip.map(|grip| grip.slipping), 100.0, 0),
             or_dash(lap.grip.map(|grip| grip.alignment), 100.0, 1),
             or_dash(lap.lateral_m, 100.0, 2),
-            kinds.get(i).copied().flatten().unwrap_or_default().to_owned(),
+            lap.void.unwrap_or_default().to_owned(),
         ];
         text.push_str(&format!(
             "<tr><td>{}</td>{}<td>+{:.3}</td>{cells}{}</tr>",
             lap.lap,
-            match &lap.void {
-                Some(why) => format!("<td>{:.3} void: {why}</td>", lap.time_s),
-                None => time(Some(lap.time_s), best),
-            },
+            time(Some(lap.time_s), best.filter(|_| lap.void.is_none())),
             lap.time_s - best.unwrap_or(lap.time_s),
             tds(&rest),
         ));

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use protocol::{CarName, MapReply, Pose2, State, Telemetry, Topic};
 use serde::Serialize;
 
-use crate::analysis::{AnalysisView, LapBook, LapData, LapKind, SessionLaps};
+use crate::analysis::{AnalysisView, LapBook, LapData, SessionLaps};
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
 use crate::fleet::Lap;
@@ -80,7 +80,8 @@ pub struct TableRow {
     pub set: String,
     /// Number of laps.
     pub laps: usize,
-    /// Laps of these that do not count: the car stood still, a pose was given or the like.
+    /// Laps of these that are void: the car stood still, a pose was given or the like. The figures below leave them out,
+    /// unless there are no others.
     pub left_out: usize,
     /// Lap time, mean and standard deviation \[s\].
     pub time_s: MeanSigma,
@@ -101,7 +102,7 @@ pub struct MeanSigma {
     pub sigma: f64,
 }
 
-/// Error of the published pose against the truth.
+/// Error of the published pose against the truth, without the first two seconds of each run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TrueError {
     /// Poses compared.
@@ -124,6 +125,8 @@ struct Series {
     map: Option<std::sync::Arc<MapReply>>,
     length: Option<f64>,
     poses: Vec<PosePoint>,
+    /// The run of the newest pose, and its first pose \[unix ns\].
+    run: Option<(u64, i64)>,
     healths: Vec<HealthPoint>,
     loads: Vec<[f64; 3]>,
     truths: Vec<(i64, Pose2)>,
@@ -178,6 +181,8 @@ impl Coverage {
 struct PosePoint {
     sensor: i64,
     pose: Pose2,
+    /// False in the first seconds of a run.
+    settled: bool,
 }
 
 /// A health message.
@@ -232,13 +237,6 @@ impl Report {
     }
 }
 
-impl CarReport {
-    /// For each lap, why it does not count; None for one that does.
-    fn kinds(&self) -> Vec<Option<&'static str>> {
-        kinds(&self.laps, &self.book)
-    }
-}
-
 /// Reads the events that reports need, by the time of publishing.
 pub(crate) fn read(path: &Path) -> Result<InOrder, RecordingError> {
     read_in_order(path, |topic| {
@@ -248,29 +246,6 @@ pub(crate) fn read(path: &Path) -> Result<InOrder, RecordingError> {
         );
         !large
     })
-}
-
-/// For each lap, why it does not count; None for one that does, or of which no more is known.
-fn kinds(laps: &[Lap], book: &LapBook) -> Vec<Option<&'static str>> {
-    let traces: Vec<_> = book.laps().collect();
-    let mut from = 0;
-    laps.iter()
-        .map(|lap| {
-            let same = |trace: &&std::sync::Arc<crate::analysis::LapTrace>| {
-                trace.lap == lap.lap && trace.time_s.is_some_and(|time| (time - lap.time_s).abs() < 1e-6)
-            };
-            // Laps and traces are in the same order.
-            let Some(at) = traces[from..].iter().position(same) else {
-                return lap.void;
-            };
-            let at = from + at;
-            from = at + 1;
-            match traces[at].kind {
-                LapKind::Invalid(reason) => Some(reason.words()),
-                _ => lap.void,
-            }
-        })
-        .collect()
 }
 
 #[derive(Default)]
@@ -343,11 +318,16 @@ impl Collector {
         match &**telemetry {
             Telemetry::Pose(_) | Telemetry::Health(_) if !shows(*topic) => {}
             Telemetry::Pose(pose) => {
-                let point = PosePoint {
+                let first = match series.run {
+                    Some((run, first)) if run == header.run_id => first,
+                    _ => header.sensor,
+                };
+                series.run = Some((header.run_id, first));
+                series.poses.push(PosePoint {
                     sensor: header.sensor,
                     pose: pose.pose,
-                };
-                series.poses.push(point);
+                    settled: header.sensor - first >= SETTLING,
+                });
             }
             Telemetry::Health(health) => {
                 if let Some(metrics) = &health.metrics {
@@ -419,7 +399,7 @@ impl Collector {
             };
             cars.push(CarReport {
                 laps: car.laps().to_vec(),
-                table: table(car.laps(), &kinds(car.laps(), &book)),
+                table: table(car.laps()),
                 states: states(&series.healths),
                 alarms: timeline.alarms.len(),
                 alarm_list: timeline.alarms.clone(),
@@ -462,28 +442,25 @@ impl Collector {
     }
 }
 
-fn table(laps: &[Lap], kinds: &[Option<&'static str>]) -> Vec<TableRow> {
-    let mut sets: BTreeMap<&str, Vec<(&Lap, bool)>> = BTreeMap::new();
-    for (i, lap) in laps.iter().enumerate() {
-        let counts = kinds.get(i).is_none_or(Option::is_none);
-        sets.entry(&lap.set).or_default().push((lap, counts));
+fn table(laps: &[Lap]) -> Vec<TableRow> {
+    let mut sets: BTreeMap<&str, Vec<&Lap>> = BTreeMap::new();
+    for lap in laps {
+        sets.entry(&lap.set).or_default().push(lap);
     }
-    let row = |(set, laps): (&str, Vec<(&Lap, bool)>)| {
+    let row = |(set, laps): (&str, Vec<&Lap>)| {
+        let good: Vec<&Lap> = laps.iter().filter(|lap| lap.void.is_none()).copied().collect();
+        let counted: Vec<f64> = good.iter().map(|lap| lap.time_s).collect();
+        // Void laps have no part in the means, unless there are no others.
+        let used = if good.is_empty() { &laps } else { &good };
         let values = |value: &dyn Fn(&Lap) -> Option<f64>| {
-            let values: Vec<f64> = laps.iter().filter_map(|(lap, _)| value(lap)).collect();
+            let values: Vec<f64> = used.iter().filter_map(|lap| value(lap)).collect();
             MeanSigma::of(&values)
         };
-        let counted: Vec<f64> = laps
-            .iter()
-            .filter(|(_, counts)| *counts)
-            .map(|(lap, _)| lap.time_s)
-            .collect();
         Some(TableRow {
             set: set.to_owned(),
             laps: laps.len(),
             left_out: laps.len() - counted.len(),
-            // Laps that do not count have no part in the mean, unless there are no others.
-            time_s: MeanSigma::of(&counted).or_else(|| values(&|lap| Some(lap.time_s)))?,
+            time_s: values(&|lap| Some(lap.time_s))?,
             quartiles_s: quartiles(counted),
             lateral_m: values(&|lap| lap.lateral_m),
             alignment: values(&|lap| Some(lap.grip?.alignment)).map(|alignment| alignment.mean),
@@ -547,8 +524,13 @@ fn error_of(point: &PosePoint, truths: &[(i64, Pose2)]) -> Option<[f64; 4]> {
     Some([dx.hypot(dy), cos * dx + sin * dy, cos * dy - sin * dx, heading])
 }
 
+/// The first poses of a run do not count: the localizer starts from a given pose. `car-node race` and `evaluate` have the same
+/// rule \[ns\].
+const SETTLING: i64 = 2_000_000_000;
+
 fn true_error(poses: &[PosePoint], truths: &[(i64, Pose2)]) -> Option<TrueError> {
-    let errors: Vec<_> = poses.iter().filter_map(|point| error_of(point, truths)).collect();
+    let settled = poses.iter().filter(|point| point.settled);
+    let errors: Vec<_> = settled.filter_map(|point| error_of(point, truths)).collect();
     let rms = |i: usize| (errors.iter().map(|e| e[i].powi(2)).sum::<f64>() / errors.len() as f64).sqrt();
     (!errors.is_empty()).then(|| TrueError {
         poses: errors.len(),
@@ -584,7 +566,7 @@ mod tests {
     #[test]
     fn table_one_has_a_row_for_each_set() {
         let laps = [lap(1, 9.0, "hq"), lap(2, 9.2, "hq"), lap(3, 10.0, "lq")];
-        let rows = table(&laps, &[None; 3]);
+        let rows = table(&laps);
         assert_eq!(rows.len(), 2);
         assert!(
             rows[0]
@@ -601,22 +583,23 @@ mod tests {
                 sigma: 0.0
             }
         );
-        assert!(table(&[], &[]).is_empty());
+        assert!(table(&[]).is_empty());
     }
 
     /// One lap with a spin made the spread of all laps as large as a lap is long.
     #[test]
     fn a_lap_that_does_not_count_is_left_out_of_the_median() {
-        let laps: Vec<Lap> = [9.0, 9.1, 15.8, 9.2]
+        let mut laps: Vec<Lap> = [9.0, 9.1, 15.8, 9.2]
             .iter()
             .zip(1..)
             .map(|(t, i)| lap(i, *t, "hq"))
             .collect();
-        let row = &table(&laps, &[None, None, Some("the car stood still"), None])[0];
+        laps[2].void = Some("the car stood still");
+        let row = &table(&laps)[0];
         assert_eq!((row.laps, row.left_out), (4, 1));
         let [low, median, high] = row.quartiles_s.expect("three laps");
         assert!((median - 9.1).abs() < 1e-9 && (low - 9.05).abs() < 1e-9 && (high - 9.15).abs() < 1e-9);
-        assert_eq!(table(&laps[..1], &[Some("")])[0].quartiles_s, None);
+        assert_eq!(table(&laps[2..3])[0].quartiles_s, None);
     }
 
     #[test]
@@ -631,6 +614,7 @@ mod tests {
         let point = |sensor, x, y| PosePoint {
             sensor,
             pose: at(x, y),
+            settled: true,
         };
         // Half way the truth is at y = 0.1; the pose is 0.03 behind it and 0.04 to its right.
         let error = true_error(&[point(10_000_000, 0.04, 0.07)], &truths).expect("compared");

@@ -139,7 +139,7 @@ struct SentState {
     log: u64,
     epoch: Option<u64>,
     /// The selected car, its number of laps, and when its health profile was sent.
-    car: Option<(CarName, usize, Instant)>,
+    car: Option<(CarName, u64, Instant)>,
     access: Access,
 }
 
@@ -154,7 +154,7 @@ impl SentState {
 
     /// Details of `car`, without what has not changed.
     fn details(&mut self, car: &Car) -> Selected {
-        let count = car.laps().len();
+        let count = car.lap_changes();
         let (laps_known, profile_sent) = match &self.car {
             Some((name, laps, profile_sent)) if *name == car.name => (Some(*laps), Some(*profile_sent)),
             _ => (None, None),

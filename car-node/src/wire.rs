@@ -6,11 +6,10 @@ use protocol::{
     Candidate, Cell, Cloud, CloudParticle, Covariance, EndPoint, EndPointKind, Health, Latency, MapRaceline,
     MapReply, Pose2, PoseKind, RecordedOdometry, RecordedScan, ScanView, TrackPoint, Truth, Twist2, Value,
 };
-use synpf::{Hypothesis, Odometry, Scan, Twist};
+use synpf::{Hypothesis, Odometry, Scan, Stamp, Twist};
 
 use crate::health::Metrics;
 use crate::sensors::TrueMotion;
-use crate::sensors::clock::SensorClock;
 pub(crate) use crate::statistics::finite;
 use crate::telemetry::counters::Spread;
 use crate::telemetry::queue::{BeamClass, CloudSample, HealthReport, PoseReport, ScanPoints};
@@ -141,11 +140,11 @@ fn metrics(metrics: &Metrics) -> protocol::Metrics {
     }
 }
 
-/// A health report. Its times are converted from the sensors' clock to wall time.
-pub fn health(report: &HealthReport, clock: &SensorClock) -> Health {
+/// A health report. `wall` converts its times from the sensors' clock to wall time.
+pub fn health(report: &HealthReport, wall: impl Fn(Stamp) -> Stamp) -> Health {
     Health {
         state: report.verdict.state,
-        since: clock.wall(report.verdict.since).0,
+        since: wall(report.verdict.since).0,
         causes: report
             .verdict
             .causes
@@ -158,7 +157,7 @@ pub fn health(report: &HealthReport, clock: &SensorClock) -> Health {
         proposal: report.proposal.as_ref().map(|proposal| protocol::Proposal {
             set: proposal.set.clone(),
             evidence: proposal.evidence.clone(),
-            since: clock.wall(proposal.since).0,
+            since: wall(proposal.since).0,
         }),
         auto: report.auto,
     }

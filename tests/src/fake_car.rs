@@ -7,14 +7,15 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use car_node::telemetry::replay_buffer::ReplayBuffer;
+use car_node::telemetry::shared_state::DEFAULT_RATES;
 use keys::{Protection, Side};
 use pitwall::unix_now;
 use protocol::{
     Action, Answer, Candidate, CarInfo, CarName, Cell, ClockReply, ClockRequest, Cloud, CloudParticle,
     Command, Covariance, Drops, EndPoint, EndPointKind, Event, EventKind, Health, Key, Latency, Load,
     MapRaceline, MapReply, Message, Metrics, MissingRequest, Outcome, ParameterSet, Params, ParamsAction,
-    Pose, Pose2, PoseKind, RecordedOdometry, RecordedScan, RelocalizeAction, Reply, ScanView, SetRef, Stamps,
-    State, Topic, TrackPoint, Truth, Twist2, Value, decode, encode,
+    Pose, Pose2, PoseKind, Rates, RatesAction, RecordedOdometry, RecordedScan, RelocalizeAction, Reply,
+    ScanView, SetRef, Stamps, State, Topic, TrackPoint, Truth, Twist2, Value, decode, encode,
 };
 use tokio::task::JoinHandle;
 use zenoh::{Config, Session};
@@ -63,6 +64,7 @@ struct CarState {
     set: SetRef,
     who: String,
     run_id: u64,
+    rates: Rates,
 }
 
 impl CarState {
@@ -121,6 +123,7 @@ impl FakeCar {
             },
             who: "start".into(),
             run_id,
+            rates: DEFAULT_RATES,
         }));
         let running = Arc::new(AtomicBool::new(true));
         let topics = Topics::declare(&session, &name, run_id, behaviour).await;
@@ -148,6 +151,11 @@ impl FakeCar {
     /// The set in force.
     pub fn set(&self) -> SetRef {
         self.state.lock().expect("no panic").set.clone()
+    }
+
+    /// The telemetry rates that it was given. It sends at its own, whatever they are.
+    pub fn rates(&self) -> Rates {
+        self.state.lock().expect("no panic").rates
     }
 
     /// Stops publishing. Returns the last number of each topic. Lost messages can still be requested.
@@ -436,7 +444,8 @@ fn recorded_scan(update: u64) -> RecordedScan {
     }
 }
 
-fn load() -> Load {
+/// The load of a car on a machine of its own.
+pub(crate) fn load() -> Load {
     let latency = Latency {
         p50: 200.0,
         p99: 400.0,
@@ -588,7 +597,12 @@ async fn declare_queryables(
         .background()
         .await
         .expect("a queryable");
-    for topic in [Topic::CmdParams, Topic::CmdPose, Topic::CmdRelocalize] {
+    for topic in [
+        Topic::CmdParams,
+        Topic::CmdPose,
+        Topic::CmdRelocalize,
+        Topic::CmdRates,
+    ] {
         execute_on(session, key(topic), state.clone(), behaviour).await;
     }
 }
@@ -664,6 +678,15 @@ fn execute(state: &mut CarState, command: &Command) -> Answer {
             update: None,
             reply: Reply::Candidates((1..=3).map(candidate).collect()),
         },
+        (Action::Rates(action), _) => {
+            if let RatesAction::Set(rates) = action {
+                state.rates = *rates;
+            }
+            Outcome::Done {
+                update: None,
+                reply: Reply::Rates(state.rates),
+            }
+        }
         (Action::Pose(_) | Action::Relocalize(_), _) => Outcome::Done {
             update: Some(1),
             reply: Reply::Nothing,

@@ -1,7 +1,7 @@
 //! Harness for whole-system tests.
 //!
 //! It gives pit walls and cars on private loopback endpoints, and two kinds of car: [`FakeCar`], which only speaks the
-//! protocol, and [`start_real`], a whole node on a simulated track. It also writes a bag of a drive through a small room
+//! protocol, and [`start_real`], a whole node on a simulated track. It also records a race ([`RaceSession`]), writes a bag of a drive through a small room
 //! ([`write_bag`]), has a link that can be cut ([`Link`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
 //! deadline ([`wait_until`]).
 
@@ -9,6 +9,7 @@
 mod browser;
 mod fake_car;
 mod link;
+mod race_session;
 mod real_car;
 mod steal_time;
 mod synthetic_bag;
@@ -17,6 +18,7 @@ mod synthetic_bag;
 pub use browser::Browser;
 pub use fake_car::{Behaviour, FakeCar};
 pub use link::Link;
+pub use race_session::RaceSession;
 pub use real_car::{start_real, start_real_protected, start_recording};
 pub use steal_time::steal_time;
 pub use synthetic_bag::{room, true_pose, write_bag};

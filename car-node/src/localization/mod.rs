@@ -13,8 +13,9 @@ pub mod shadow;
 pub mod shadow_channel;
 mod start;
 pub mod table_worker;
-mod views;
+pub(crate) mod views;
 
 pub use external::{External, ExternalParameters};
 pub use localizer_parameters::{EXTERNAL, KIND_KEY, LocalizerParameters};
+pub(crate) use pace::Pace;
 pub use start::Start;

@@ -4,13 +4,13 @@ use synpf::Stamp;
 
 /// Limits something to a given rate.
 #[derive(Debug, Default)]
-pub(super) struct Pace {
+pub(crate) struct Pace {
     next: Option<Stamp>,
 }
 
 impl Pace {
     /// True when something at `rate` \[Hz\] is due. The caller then does it.
-    pub(super) fn due(&mut self, now: Stamp, rate: f32) -> bool {
+    pub(crate) fn due(&mut self, now: Stamp, rate: f32) -> bool {
         if rate <= 0.0 {
             return false;
         }

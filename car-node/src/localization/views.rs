@@ -11,7 +11,7 @@ const ON_WALL: f64 = 0.10;
 const SHORT_OR_LONG: f64 = 0.3;
 
 /// The particles of an update; `particles` is a fair sample of them.
-pub(super) fn cloud(update: &Update, particles: Vec<WeightedPose>) -> CloudSample {
+pub(crate) fn cloud(update: &Update, particles: Vec<WeightedPose>) -> CloudSample {
     CloudSample {
         stamp: update.stamp,
         update: update.number,
@@ -25,7 +25,7 @@ pub(super) fn cloud(update: &Update, particles: Vec<WeightedPose>) -> CloudSampl
 }
 
 /// Every n-th end point of a scan at the pose of its update, at most [`protocol::ScanView::MAX_POINTS`] of them.
-pub(super) fn scan_points(
+pub(crate) fn scan_points(
     update: &Update,
     scan: &Scan,
     map: &TrackMap,

@@ -6,6 +6,7 @@
 mod alignment;
 mod paper;
 mod results;
+mod transmitter;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -22,6 +23,7 @@ use synpf::{Localizer, Odometry, Scan, SetUpError, Stamp, TrackMap, Twist};
 pub use alignment::{PAPER_DISTANCE, paper_alignment};
 pub use paper::{PAPER_ROWS, PaperRow};
 pub use results::{CarResult, LapRecord, LoadSummary, Mishap, MishapKind, RaceSummary, Stretch};
+pub use transmitter::{Content, Transmission};
 
 use crate::health::{Monitor, Thresholds};
 use crate::localization::LocalizerParameters;
@@ -29,6 +31,7 @@ use crate::sensors::bag::{Arrival, SensorEvent};
 use crate::sensors::{Script, ScriptedIncident, sensor_event};
 use crate::stress::{ArrivalQueue, DamageChain, DamagedArrival, Defect, DefectKind, map_damage};
 use results::CarMeasurements;
+use transmitter::Transmitter;
 
 /// Where a driver gets the car's pose from.
 #[derive(Debug, Clone, PartialEq)]
@@ -126,6 +129,29 @@ pub fn race(
     map: &Arc<TrackMap>,
     setup: &RaceSetup,
 ) -> Result<Vec<CarResult>, SetUpError> {
+    race_with(track, map, setup, None)
+}
+
+/// The same race; `listen` gets every message that its cars would send to a pit wall. `set` is the name of their set.
+pub fn transmitted_race(
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    setup: &RaceSetup,
+    set: &str,
+    listen: &mut dyn FnMut(Transmission),
+) -> Result<Vec<CarResult>, SetUpError> {
+    race_with(track, map, setup, Some((set, listen)))
+}
+
+/// The name of the set, and who gets the messages of the cars.
+type Listener<'a> = (&'a str, &'a mut dyn FnMut(Transmission));
+
+fn race_with(
+    track: &Arc<Track>,
+    map: &Arc<TrackMap>,
+    setup: &RaceSetup,
+    listener: Option<Listener<'_>>,
+) -> Result<Vec<CarResult>, SetUpError> {
     let expected = f64::from(setup.laps) * track.lap_time() / setup.speed_scale;
     let end = End {
         laps: Some(setup.laps),
@@ -141,9 +167,10 @@ pub fn race(
         track,
         &map,
         &field,
-        Incidents {
+        Extras {
             script: Vec::new(),
             sensors: sensors.collect(),
+            listener,
         },
         &setup.pose_source,
         end,
@@ -151,12 +178,13 @@ pub fn race(
     )
 }
 
-/// What goes wrong in a race.
-struct Incidents {
+/// What goes wrong in a race, and who listens.
+struct Extras<'a> {
     /// Incidents at set times.
     script: Vec<ScriptedIncident>,
     /// Defects of each car's sensors; cars without an entry have none.
     sensors: Vec<DamageChain>,
+    listener: Option<Listener<'a>>,
 }
 
 /// When a race ends.
@@ -191,34 +219,39 @@ pub fn run(
     end: End,
     seed: u64,
 ) -> Result<Vec<CarResult>, SetUpError> {
-    let sensors = Vec::new();
-    drive(
-        track,
-        map,
-        setups,
-        Incidents { script, sensors },
-        pose_source,
-        end,
-        seed,
-    )
+    let extras = Extras {
+        script,
+        sensors: Vec::new(),
+        listener: None,
+    };
+    drive(track, map, setups, extras, pose_source, end, seed)
 }
 
 fn drive(
     track: &Arc<Track>,
     map: &Arc<TrackMap>,
     setups: &[CarSetup],
-    incidents: Incidents,
+    extras: Extras<'_>,
     pose_source: &PoseSource,
     end: End,
     seed: u64,
 ) -> Result<Vec<CarResult>, SetUpError> {
     let mut world = World::new(Arc::clone(track), setups, seed);
-    let mut script = Script::new(incidents.script);
-    let mut sensors = incidents.sensors.into_iter();
+    let mut script = Script::new(extras.script);
+    let mut sensors = extras.sensors.into_iter();
     let mut runners = (0..)
         .zip(setups)
         .map(|(index, car)| CarRunner::new(&world, index, map, pose_source, car, seed, sensors.next()))
         .collect::<Result<Vec<_>, _>>()?;
+
+    let mut listener = extras.listener;
+    if let Some((set, _)) = &listener {
+        for (runner, car) in runners.iter_mut().zip(setups) {
+            let laser = car.lidar.base_link_from_laser;
+            let transmitter = Transmitter::new(Arc::clone(track), Arc::clone(map), laser, (*set).to_owned());
+            runner.transmitter = Some(transmitter);
+        }
+    }
 
     let begin = Instant::now();
     let done = |runners: &[CarRunner]| {
@@ -234,6 +267,16 @@ fn drive(
             let index = output.car;
             if let Some(estimate) = runners[index].handle(&world, index, &output.message) {
                 world.guide(index, estimate);
+            }
+            if let (Some((_, listen)), Some(transmitter)) = (&mut listener, &mut runners[index].transmitter) {
+                for (stamp, content) in transmitter.take() {
+                    listen(Transmission {
+                        car: index,
+                        sent: self::stamp(world.now()),
+                        stamp,
+                        content,
+                    });
+                }
             }
         }
     }
@@ -258,6 +301,8 @@ struct CarRunner {
     latest: Option<Odometry>,
     /// The speed \[m/s\] and the yaw rate [rad/s] that the driver gets. They come from sensors without defects.
     speeds: [f64; 2],
+    /// Makes the messages to a pit wall, where somebody listens.
+    transmitter: Option<Transmitter>,
 }
 
 enum ActivePoseSource {
@@ -303,6 +348,7 @@ impl CarRunner {
             base_link_from_laser,
             latest: None,
             speeds: [0.0; 2],
+            transmitter: None,
         })
     }
 
@@ -338,6 +384,9 @@ impl CarRunner {
         let pose = match &damaged.arrival.event {
             SensorEvent::Odometry(odometry) => {
                 self.latest = Some(*odometry);
+                if let Some(transmitter) = &mut self.transmitter {
+                    transmitter.on_odometry(odometry);
+                }
                 let pose = self.on_odometry(odometry, world, index)?;
                 self.measurements.on_a_lap = world.on_a_lap(index);
                 let at = world.truth(index).track;
@@ -369,12 +418,18 @@ impl CarRunner {
         match message {
             Message::Odometry(_) | Message::Gyro(_) | Message::Scan(_) => {}
             Message::Truth(truth) => {
+                if let Some(transmitter) = &mut self.transmitter {
+                    transmitter.on_truth(truth, stamp(truth.stamp));
+                }
                 self.truths.push_back((stamp(truth.stamp), truth.pose));
                 if self.truths.len() > 50 {
                     self.truths.pop_front();
                 }
             }
             Message::Placed(pose) => {
+                if let Some(transmitter) = &mut self.transmitter {
+                    transmitter.on_placed(*pose, stamp(world.now()));
+                }
                 // The localizer gets the pose at which the recovery crew put the car.
                 match &mut self.pose_source {
                     ActivePoseSource::Localizer(localizer, monitor) => {
@@ -463,7 +518,11 @@ impl CarRunner {
             }
         };
         monitor.on_sweep(scan.sweep());
-        let state = monitor.on_update(&update, now).state;
+        let verdict = monitor.on_update(&update, now);
+        let state = verdict.state;
+        if let Some(transmitter) = &mut self.transmitter {
+            transmitter.on_update(&update, scan, |most| localizer.particles(most), verdict, now);
+        }
         self.measurements.judged(update.stamp, state, update.pose, truth);
         let twist = [update.twist.linear_x, update.twist.angular];
         self.measurements.scanned(

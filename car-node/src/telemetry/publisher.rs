@@ -136,7 +136,7 @@ impl Publisher {
                 recorded,
             } => {
                 let stamp = self.clock.wall(report.stamp);
-                let message = wire::health(&report, &self.clock);
+                let message = wire::health(&report, |stamp| self.clock.wall(stamp));
                 if live {
                     self.send(Topic::Health, stamp, &message);
                 }

@@ -170,6 +170,13 @@ impl State {
                     text: text.clone(),
                 });
             }
+            let limits = car.book().line().and_then(|line| self.fleet.limits(&line.key));
+            if let Some(limits) = limits.filter(|limits| limits.iter().next().is_some()) {
+                push(EventPayload::Marker {
+                    who: "pit wall".into(),
+                    text: limits.to_note().into(),
+                });
+            }
             if let Some((offset, round_trip)) = car.clock() {
                 push(EventPayload::Clock {
                     run_id: None,

@@ -11,7 +11,7 @@
 use std::process::{Child, Command, Stdio};
 use std::sync::LazyLock;
 
-use pitwall::{PageOptions, PitWallOptions, PitWallServer, read_events};
+use pitwall::{Fleet, PageOptions, PitWallOptions, PitWallServer, read_events};
 use serde_json::Value;
 use system_tests::{Behaviour, Browser, FakeCar, free_endpoint, router, wait_until};
 use tokio::sync::{Mutex, MutexGuard};
@@ -347,6 +347,28 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
     // Fake cars report 2 s for every lap. Each sector is rounded to a hundredth.
     assert!((one + two + three - time).abs() < 0.5, "{lap}");
 
+    // A limit of one's own raises an alarm, and is kept with the track.
+    let note = "alarm limits: alignment 95 %";
+    browser.click("#tab-log").await;
+    browser.click("#limits-button").await;
+    browser
+        .wait("the dialog", "document.getElementById('limits').open")
+        .await;
+    browser.fill("#limit-alignment", "95").await;
+    browser
+        .wait(
+            "an alarm",
+            &logged("car-1 alignment 90.0 % beyond the limit of 95.0 % at s ="),
+        )
+        .await;
+    browser.wait("the limits are in the log", &logged(note)).await;
+    assert_eq!(
+        std::fs::read_dir(bench.recordings.path().join("tracks"))
+            .expect("a folder of tracks")
+            .count(),
+        1
+    );
+
     // A marker goes into the recording.
     browser.key("r").await;
     browser
@@ -373,10 +395,9 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
         .await;
     let file = std::fs::read_dir(bench.recordings.path())
         .expect("a folder")
-        .next()
-        .expect("a recording")
-        .expect("readable")
-        .path();
+        .map(|entry| entry.expect("readable").path())
+        .find(|path| path.extension().is_some_and(|extension| extension == "mcap"))
+        .expect("a recording");
     let markers: Vec<String> = read_events(&file)
         .expect("a recording")
         .filter_map(|event| match event.expect("whole").payload {
@@ -384,7 +405,20 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
             _ => None,
         })
         .collect();
-    assert_eq!(markers, ["ana: rain at turn two"]);
+    // The limits that held at its start, once for each car on the track.
+    let limits = format!("pit wall: {note}");
+    let (limits, others): (Vec<String>, Vec<String>) =
+        markers.into_iter().partition(|marker| *marker == limits);
+    assert_eq!(
+        (limits.len(), &others[..]),
+        (2, &["ana: rain at turn two".to_owned()][..])
+    );
+    let mut replayed = Fleet::default();
+    for event in read_events(&file).expect("a recording") {
+        replayed.apply(&event.expect("whole"));
+    }
+    let alarms = replayed.log().since(0).filter(|entry| entry.kind == "limit");
+    assert!(alarms.count() > 0, "a replay raises the engineer's alarms, too");
 
     // The run sheet is shown with the car.
     browser.key("w").await;
@@ -404,26 +438,6 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
             "pitwall.snapshot.cars[0].run_sheet === 'tyre: taped'",
         )
         .await;
-
-    // A limit of one's own raises an alarm, and is kept with the track.
-    browser.click("#tab-log").await;
-    browser.click("#limits-button").await;
-    browser
-        .wait("the dialog", "document.getElementById('limits').open")
-        .await;
-    browser.fill("#limit-alignment", "95").await;
-    browser
-        .wait(
-            "an alarm",
-            &logged("car-1 alignment 90.0 % beyond the limit of 95.0 % at s ="),
-        )
-        .await;
-    assert_eq!(
-        std::fs::read_dir(bench.recordings.path().join("tracks"))
-            .expect("a folder of tracks")
-            .count(),
-        1
-    );
 
     // The large view, the help and every tab open without an error.
     for key in ["o", "p", "u", "Escape", "f", "0", "e", "ArrowDown", "ArrowUp"] {
@@ -752,6 +766,25 @@ async fn alarms_outlive_a_reload_and_a_gone_car_can_be_dismissed() {
     page.wait("a trial is offered", &trial).await;
     page.evaluate(&format!("{trial}.click()")).await;
     page.wait("hq is in force", &in_force("hq")).await;
+
+    // The last command is undone by one key: first the rates, then the set.
+    page.key("y").await;
+    page.wait("the rates of the car", "document.getElementById('rates').open")
+        .await;
+    page.fill("#rate-cloud", "2").await;
+    wait_until("the rates are on the car", || stays.rates().cloud < 3.0).await;
+    let pose = stays.rates().pose;
+    assert!((pose - 1000.0).abs() < 1e-3, "the others are as they were");
+    page.wait(
+        "the answer is there",
+        &format!("{}.querySelector('.note p.done')", card("car-1")),
+    )
+    .await;
+    page.key("z").await;
+    answer_question(&page, "Undo the telemetry rates on car-1?").await;
+    wait_until("the rates are as before", || stays.rates().cloud > 9.0).await;
+    page.key("z").await;
+    answer_question(&page, "Undo set hq on car-1?").await;
 
     // Tabs by arrow keys.
     page.evaluate("document.getElementById('tab-log').focus()").await;

@@ -29,6 +29,47 @@ impl Limits {
         self.0.clone()
     }
 
+    /// Start of a note that has the limits.
+    const NOTE: &str = "alarm limits: ";
+
+    /// The limits as a note in the recording: `alarm limits: alignment 95 %, slip 8 %`.
+    pub(crate) fn to_note(&self) -> String {
+        let parts: Vec<String> = self
+            .iter()
+            .map(|(channel, limit)| {
+                let info = channel.info();
+                let shown = (limit * info.factor * 1e6).round() / 1e6;
+                format!("{} {shown} {}", info.label, info.unit)
+                    .trim_end()
+                    .to_owned()
+            })
+            .collect();
+        let list = if parts.is_empty() {
+            "none".to_owned()
+        } else {
+            parts.join(", ")
+        };
+        format!("{}{list}", Self::NOTE)
+    }
+
+    /// The limits of a note; None for any other note, and for one that cannot be read.
+    pub(crate) fn of_note(note: &str) -> Option<Self> {
+        let list = note.strip_prefix(Self::NOTE)?;
+        let mut limits = BTreeMap::new();
+        for part in list.split(", ").filter(|part| *part != "none") {
+            let (channel, rest) = Channel::ALL.into_iter().find_map(|channel| {
+                Some((
+                    channel,
+                    part.strip_prefix(channel.info().label)?.strip_prefix(' ')?,
+                ))
+            })?;
+            let shown: f64 = rest.split(' ').next()?.parse().ok()?;
+            let info = channel.info();
+            limits.insert(info.name.to_owned(), shown / info.factor);
+        }
+        Self::new(limits).ok()
+    }
+
     /// Each metric with its limit.
     pub fn iter(&self) -> impl Iterator<Item = (Channel, f64)> + '_ {
         self.0
@@ -116,6 +157,33 @@ mod tests {
             }
         }
         assert_eq!(raised, [(Channel::Slip, 13), (Channel::Slip, 63)]);
+    }
+
+    #[test]
+    fn a_note_has_every_limit() {
+        let all = Channel::ALL.into_iter().zip(1..);
+        let all: BTreeMap<String, f64> = all
+            .map(|(channel, i)| (channel.name().to_owned(), f64::from(i) * 0.031))
+            .collect();
+        for limits in [all, BTreeMap::new()] {
+            let limits = Limits::new(limits).expect("good");
+            let read = Limits::of_note(&limits.to_note()).expect("a note of limits");
+            assert_eq!(read.iter().count(), limits.iter().count());
+            for ((channel, limit), (_, read)) in limits.iter().zip(read.iter()) {
+                assert!((limit - read).abs() < 1e-6 * limit, "{channel:?}: {limit} {read}");
+            }
+        }
+        let two = BTreeMap::from([("slip".to_owned(), 0.08), ("alignment".to_owned(), 0.955)]);
+        let note = Limits::new(two).expect("good").to_note();
+        assert_eq!(note, "alarm limits: alignment 95.5 %, slip 8 %");
+        for other in [
+            "rain",
+            "alarm limits: speeed 3 m/s",
+            "alarm limits: slip NaN %",
+            "alarm limits: slip",
+        ] {
+            assert_eq!(Limits::of_note(other), None, "{other}");
+        }
     }
 
     #[test]

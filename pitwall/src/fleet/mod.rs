@@ -143,6 +143,10 @@ impl Fleet {
                 if text.starts_with(Car::RUN_SHEET) {
                     car.run_sheet = Some((Arc::clone(who), Arc::clone(text)));
                 }
+                let line = car.book().line().map(|line| line.key.clone());
+                if let (Some(key), Some(limits)) = (line, Limits::of_note(text)) {
+                    self.limits.insert(key, limits);
+                }
                 let (car, text, who) = (Some(name.clone()), text.to_string(), Some(who.to_string()));
                 self.add_entry(at, car, Severity::Info, "marker", text, who);
             }

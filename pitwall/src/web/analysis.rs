@@ -148,28 +148,28 @@ pub(super) async fn set_limits(
         Ok(_) => return (StatusCode::BAD_REQUEST, "too long").into_response(),
         Err(fault) => return (StatusCode::BAD_REQUEST, fault).into_response(),
     };
-    on_a_thread(move || {
-        if let Err(fault) = app.tracks.keep_limits(&line, limits.clone()) {
-            return (StatusCode::INTERNAL_SERVER_ERROR, fault).into_response();
-        }
-        let text = format!(
-            "alarm limits on {} are set: {} metrics",
-            line.name,
-            limits.iter().count()
-        );
-        let mut fleet = app.bus.fleet();
-        fleet.set_limits(&line.key, limits);
-        fleet.add_entry(
+    let (tracks, kept) = (app.tracks.clone(), limits.clone());
+    let on_line = line.clone();
+    let written = tokio::task::spawn_blocking(move || tracks.keep_limits(&on_line, kept)).await;
+    match written.map_err(|error| error.to_string()) {
+        Ok(Ok(())) => {}
+        Ok(Err(fault)) | Err(fault) => return (StatusCode::INTERNAL_SERVER_ERROR, fault).into_response(),
+    }
+    let note = limits.to_note();
+    app.bus.fleet().set_limits(&line.key, limits);
+    match &app.service {
+        // A note, so that they are part of the recording.
+        Some(service) => service.mark(&car, &operator, &note).await,
+        None => app.bus.fleet().add_entry(
             app.now(),
             None,
             protocol::Severity::Info,
             "limit",
-            text,
+            note,
             Some(operator),
-        );
-        StatusCode::NO_CONTENT.into_response()
-    })
-    .await
+        ),
+    }
+    StatusCode::NO_CONTENT.into_response()
 }
 
 #[derive(Deserialize)]

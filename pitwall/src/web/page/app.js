@@ -43,12 +43,19 @@ const sets = async (car, name, revision, revert_after_ms) => {
   if (result.done && before !== name) done.push({ car, what: `set ${name}`, undo: () => act(car, { params: "revert" }) });
   return result;
 };
+/// Goes back to the set before. To undo that puts the one in force again.
+async function revert(car) {
+  const before = snapshot?.cars.find((c) => c.car === car)?.set?.name;
+  const result = await act(car, { params: "revert" });
+  if (result.done && before) done.push({ car, what: `the way back to the set before (put ${before} in force again)`, undo: () => act(car, { params: { select: { name: before, revert_after_ms: null } } }) });
+  return result;
+}
 const acts = {
   select,
   choose: (car, name, revision) => sets(car, name, revision, null),
   trial: (car, name, revision) => sets(car, name, revision, TRIAL),
   confirm: (car) => act(car, { params: "confirm" }),
-  revert: (car) => act(car, { params: "revert" }),
+  revert,
   record: (car, on) => act(car, { record: on ? "start" : "stop" }),
   dismiss: (car) => post("/dismiss", { car, operator: operator.value }),
   shadow: (car, name) => act(car, { params: { shadow: { name: name ?? null } } }),
@@ -265,7 +272,7 @@ function showReplay(replay) {
     if (!speeds.includes(String(replay.speed))) $("speed").append(new Option(replay.speed));
     $("speed").value = String(replay.speed);
   }
-  for (const id of ["place", "search", "mark", "sheet-button"]) $(id).disabled = true;
+  for (const id of ["place", "search", "mark", "sheet-button", "rates-button"]) $(id).disabled = true;
 }
 const setPlayback = (change) => snapshot?.replay && post("/replay", change);
 const playPause = () => setPlayback({ playing: !snapshot.replay.playing });
@@ -334,8 +341,10 @@ function outdate(car) {
 async function search(car = selected) {
   if (!car) return;
   select(car);
+  const before = snapshot?.cars.find((c) => c.car === car)?.pose;
   const result = await act(car, { relocalize: "search" });
   const candidates = result.verdict?.answer?.outcome?.done?.reply?.candidates ?? [];
+  if (result.done && before) rememberPose(car, before);
   if (result.done) {
     const best = candidates.reduce((a, c) => (a && a.score >= c.score ? a : c), null);
     const found = best ? `${candidates.length} ${candidates.length === 1 ? "place fits" : "places fit"}: number ${best.number} at ${fixed(best.pose.x, 1)}, ${fixed(best.pose.y, 1)} m fits best` : "the search has begun; no place fits yet";
@@ -346,8 +355,36 @@ async function search(car = selected) {
 
 async function picked(candidate) {
   offer([]);
-  await act(selected, { relocalize: { pick: { candidate } } });
+  const car = selected;
+  const before = snapshot?.cars.find((c) => c.car === car)?.pose;
+  const result = await act(car, { relocalize: { pick: { candidate } } });
+  if (result.done && before) rememberPose(car, before);
 }
+
+/// The telemetry rates of the selected car: what it sends of each kind every second.
+const RATES = ["pose", "cloud", "scan", "health"];
+let ratesBefore = null;
+async function rates() {
+  if (!selected || snapshot?.replay) return;
+  const car = selected;
+  const result = await act(car, { rates: "get" });
+  const now = result.verdict?.answer?.outcome?.done?.reply?.rates;
+  if (!now) return;
+  ratesBefore = { car, rates: now };
+  for (const kind of RATES) $(`rate-${kind}`).value = String(now[kind]);
+  $("rate-recorded").checked = now.recorded;
+  $("rates-title").textContent = `Telemetry rates of ${car}`;
+  $("rates").returnValue = "";
+  $("rates").showModal();
+}
+$("rates").addEventListener("close", async () => {
+  if ($("rates").returnValue !== "ok" || !ratesBefore) return;
+  const { car, rates: before } = ratesBefore;
+  const wanted = { recorded: $("rate-recorded").checked };
+  for (const kind of RATES) wanted[kind] = Number($(`rate-${kind}`).value);
+  const result = await act(car, { rates: { set: wanted } });
+  if (result.done) done.push({ car, what: "the telemetry rates", undo: () => act(car, { rates: { set: before } }) });
+});
 
 function follow(on = !track.follow) {
   track.follow = on;
@@ -555,7 +592,7 @@ const sessions = new SessionDialog($("sessions"), { words: $("sessions-words"), 
 const showSessions = () => sessions.open();
 const CLICKS = {
   record, theme: otherTheme, "help-button": help, "sessions-button": showSessions, fit, follow: () => follow(), paint, place: () => place(!track.placing), search: () => search(),
-  mark, rerun, acknowledge, alarm: acknowledge, "limits-button": editLimits, "sheet-button": sheet, sound: () => sound.toggle(),
+  mark, rerun, acknowledge, alarm: acknowledge, "limits-button": editLimits, "rates-button": rates, "sheet-button": sheet, sound: () => sound.toggle(),
 };
 for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
 
@@ -574,7 +611,7 @@ const askForSet = (name) => {
     ["try it for 60 s, then fall back", () => acts.trial(selected, name, car.set.revision)]);
 };
 const KEYS = {
-  r: record, t: otherTheme, "?": help, b: showSessions, 0: fit, f: () => follow(), m: mark, w: sheet, z: undo,
+  r: record, t: otherTheme, "?": help, b: showSessions, y: rates, 0: fit, f: () => follow(), m: mark, w: sheet, z: undo,
   g: () => selected && ask(`Search the whole map for ${selected}? It gives up its pose meanwhile.`, ["search (Enter)", () => search()]),
   x: () => selected && ask(`Go back to the set before on ${selected}?`, ["go back (Enter)", () => acts.revert(selected)]), p: paint, s: shadow, o: () => large(),
   v: () => $("rerun").hidden || rerun(), n: () => sound.toggle(), i: () => place(!track.placing), a: acknowledge,

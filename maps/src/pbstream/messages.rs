@@ -26,6 +26,7 @@ pub(super) struct PoseGraph {
 }
 
 #[derive(Clone, PartialEq, Message)]
+#[expect(clippy::struct_field_names, reason = "Cartographer's name")]
 pub(super) struct Trajectory {
     #[prost(message, repeated, tag = "1")]
     pub(super) node: Vec<TrajectoryNode>,

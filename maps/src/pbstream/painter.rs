@@ -71,7 +71,7 @@ pub(super) fn paint(submaps: &BTreeMap<SubmapId, Submap>) -> Result<OccupancyGri
             }
         }
     }
-    let (cells, occupancy) = pixels.iter().map(cell).unzip();
+    let (cells, occupancy) = pixels.into_iter().map(cell).unzip();
     Ok(OccupancyGrid {
         width,
         height,
@@ -83,7 +83,7 @@ pub(super) fn paint(submaps: &BTreeMap<SubmapId, Submap>) -> Result<OccupancyGri
 }
 
 /// State and grey of a cell, as `map_server` reads them from the image.
-fn cell(pixel: &Pixel) -> (Cell, u8) {
+fn cell(pixel: Pixel) -> (Cell, u8) {
     let grey = f64::from(pixel.grey).round().clamp(0.0, 255.0);
     let dark = 1.0 - grey / 255.0;
     let cell = match dark {

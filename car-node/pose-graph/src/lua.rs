@@ -51,16 +51,13 @@ impl LuaConfiguration {
         let mut values = BTreeMap::new();
         for (path, value) in reader.set {
             let key = set_key(&path);
-            let value = match known.get(key) {
-                Some(default) => {
-                    let value = as_default(value, default);
-                    given.push((key.to_owned(), value.clone()));
-                    value
-                }
-                None => {
-                    ignored.push(path.clone());
-                    as_default(value, &Value::from(0))
-                }
+            let value = if let Some(default) = known.get(key) {
+                let value = as_default(value, default);
+                given.push((key.to_owned(), value.clone()));
+                value
+            } else {
+                ignored.push(path.clone());
+                as_default(value, &Value::from(0))
             };
             values.insert(path, value);
         }

@@ -123,7 +123,7 @@ pub(crate) fn shape_of_information(grid: &ProbabilityGrid, points: &[[f32; 2]], 
     }
     let eigen = SymmetricEigen::new(information);
     let most = eigen.eigenvalues.max();
-    if !(most > 0.0) {
+    if most.is_nan() || most <= 0.0 {
         return Matrix2::identity();
     }
     let share = eigen.eigenvalues.map(|value| (value.max(0.0) / most).sqrt());

@@ -32,7 +32,7 @@ fn main() {
     let wanted = |name: &str| arguments.is_empty() || arguments.iter().any(|a| name.contains(a.as_str()));
     if wanted("ranges") {
         for (name, grid) in [("club", club()), ("5 mm cells", fine()), ("building", building())] {
-            ranges(name, grid);
+            ranges(name, &grid);
         }
     }
     if wanted("particles") {
@@ -138,7 +138,7 @@ fn range_to_face(grid: &OccupancyGrid, faces: &[[[f32; 2]; 2]], laser: Pose) -> 
         .map(|range| range * grid.resolution)
 }
 
-fn ranges(name: &str, grid: OccupancyGrid) {
+fn ranges(name: &str, grid: &OccupancyGrid) {
     let size = [grid.width, grid.height];
     let free = grid.cells.iter().filter(|cell| **cell == Cell::Free).count();
     println!(

@@ -452,7 +452,7 @@ pub(crate) mod tests {
             let found = match ranges(&map) {
                 Ranges::Table(_) => TableLayout::Table { side: map.side(0) },
                 Ranges::Cddt(_) => TableLayout::Cddt,
-                Ranges::RayMarching | Ranges::Interim => TableLayout::RayMarching,
+                _ => TableLayout::RayMarching,
             };
             assert_eq!(found, expected, "{budget}");
         }

@@ -154,7 +154,7 @@ fn ranges(name: &str, grid: &OccupancyGrid) {
     let rays = rays(&map, TIMED);
     let truth: Vec<Option<f64>> = rays[..MEASURED]
         .iter()
-        .map(|ray| range_to_face(&grid, &faces, *ray).filter(|range| *range < LONGEST))
+        .map(|ray| range_to_face(grid, &faces, *ray).filter(|range| *range < LONGEST))
         .collect();
     let in_the_middle = *rays
         .iter()

@@ -54,6 +54,16 @@ pub(super) struct Choice {
     pub(super) namespace: String,
 }
 
+impl Choice {
+    /// Whether the scan, the odometry or the IMU is read from this topic.
+    pub(super) fn has_sensor(&self, topic: &str) -> bool {
+        let Self {
+            scan, odometry, imu, ..
+        } = self;
+        topic == scan || topic == odometry || imu.as_deref() == Some(topic)
+    }
+}
+
 /// The namespace of a topic: empty for `/scan`, `/car2` for `/car2/scan`.
 pub(super) fn namespace_of(topic: &str) -> &str {
     topic.rsplit_once('/').map_or("", |(namespace, _)| namespace)

@@ -233,14 +233,7 @@ impl Ros2 {
             &found.choice.namespace,
             |kind, topic| match kind {
                 Kind::Transforms => is_transform_topic_of(topic, &found.choice.scan),
-                _ => [
-                    Some(&found.choice.scan),
-                    Some(&found.choice.odometry),
-                    found.choice.imu.as_ref(),
-                ]
-                .into_iter()
-                .flatten()
-                .any(|chosen| chosen == topic),
+                _ => found.choice.has_sensor(topic),
             },
         );
         let notes = notes(&found, options);

@@ -113,12 +113,7 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     let _services = ros
         .map(|(connection, ros_node)| ros_services(&connection, &ros_node, &node))
         .transpose()?;
-    let wall = if arguments.connect.is_empty() {
-        let nearby = if searches { " or nearby" } else { "" };
-        format!("a pit wall on this machine{nearby}")
-    } else {
-        arguments.connect.join(", ")
-    };
+    let wall = sought(arguments, searches);
     eprintln!("{car}: {description}; connects to {wall}. Ctrl-C ends it.");
     let reason = wait(
         &car,
@@ -129,16 +124,26 @@ pub(crate) fn run(arguments: &Run) -> anyhow::Result<()> {
     );
     let estimate = node.shared().latest_pose();
     node.shutdown(reason);
-    match estimate {
-        Some(estimate) => eprintln!(
-            "{car}: {reason}; last pose {:.2}, {:.2} m, {:.1} deg.",
-            estimate.pose.x,
-            estimate.pose.y,
-            estimate.pose.heading.to_degrees()
-        ),
-        None => eprintln!("{car}: {reason}; there was no pose."),
-    }
+    let last = estimate.map_or_else(
+        || "there was no pose".to_owned(),
+        |estimate| {
+            let pose = estimate.pose;
+            let heading = pose.heading.to_degrees();
+            format!("last pose {:.2}, {:.2} m, {heading:.1} deg", pose.x, pose.y)
+        },
+    );
+    eprintln!("{car}: {reason}; {last}.");
     Ok(())
+}
+
+/// The pit wall that the car connects to, in words.
+fn sought(arguments: &Run, searches: bool) -> String {
+    if arguments.connect.is_empty() {
+        let nearby = if searches { " or nearby" } else { "" };
+        format!("a pit wall on this machine{nearby}")
+    } else {
+        arguments.connect.join(", ")
+    }
 }
 
 /// The car's name. A real car has no default: two of them would have the same.

@@ -5,6 +5,8 @@
 //!                                                                `car-node race --faults`
 //! ```
 
+#![allow(clippy::print_stdout, reason = "this is the program's output")]
+
 use std::path::Path;
 
 use anyhow::{Context, bail};

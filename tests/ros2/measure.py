@@ -44,7 +44,8 @@ class Recorder:
     }
 
     def __init__(self, session):
-        self.came = {topic: [] for topic in self.TOPICS}
+        # A session that nobody keeps is closed.
+        self.session, self.came = session, {topic: [] for topic in self.TOPICS}
         self.subscribers = [
             session.declare_subscriber(f"0{topic}/{peer.dds(name)}/*", self.keep(topic)) for topic, name in self.TOPICS.items()
         ]

@@ -237,10 +237,12 @@ class Track:
         walls = np.genfromtxt(folder / "walls.csv", delimiter=";", usecols=(0, 2, 3))
         begin, end = [], []
         for wall in np.unique(walls[:, 0]):
-            # Points are 0.12 m apart; every other one will do.
-            points = walls[walls[:, 0] == wall, 1:][::2]
-            begin.append(points)
-            end.append(np.roll(points, -1, axis=0))
+            points = walls[walls[:, 0] == wall, 1:]
+            if len(points) > 20:
+                # They are 0.1 m apart; every other one will do. The last one stays: a wall may be closed, or end there.
+                points = np.vstack([points[:-1:2], points[-1:]])
+            begin.append(points[:-1])
+            end.append(points[1:])
         self.a = np.concatenate(begin)
         self.b = np.concatenate(end)
         ends = np.vstack([self.points, self.points[:1]])

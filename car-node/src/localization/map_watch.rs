@@ -96,7 +96,7 @@ impl MapWatch {
         let step = scan.ranges.len().div_ceil(BEAMS).max(1);
         let reach = scan.range_max.min(REACH);
         let mut readings = Vec::with_capacity(BEAMS);
-        let mut on_walls = 0;
+        let (mut on_walls, mut beams) = (0, 0);
         for (beam, range) in scan.ranges.iter().enumerate().step_by(step) {
             let range = f64::from(*range);
             if !(scan.range_min..reach).contains(&range) {
@@ -105,18 +105,16 @@ impl MapWatch {
             let along =
                 map_from_laser * Pose::new(0.0, 0.0, scan.angle_min + scan.angle_increment * beam as f64);
             let end = along.transform([range, 0.0]);
-            if map.distance(end).abs() < tolerance {
-                on_walls += 1;
-                readings.push((end, Reading::On));
-                continue;
-            }
+            beams += 1;
             let wall = map.range(along, reach);
             if range > wall + THROUGH {
                 readings.push((along.transform([wall, 0.0]), Reading::Through));
             }
-            readings.push((end, Reading::Off));
+            let on_wall = map.distance(end).abs() < tolerance;
+            on_walls += u32::from(on_wall && range < wall + THROUGH);
+            readings.push((end, if on_wall { Reading::On } else { Reading::Off }));
         }
-        if f64::from(on_walls) < TRUSTED * readings.len() as f64 {
+        if f64::from(on_walls) < TRUSTED * f64::from(beams) {
             return Vec::new();
         }
         for (point, reading) in readings {
@@ -267,19 +265,20 @@ mod tests {
 
     use super::*;
 
-    /// A corridor of 20 x 4 m; the lower wall is open from 8 to 11 m, and a board of 2 m stands 0.5 m inside the upper one.
+    /// A corridor of 20 x 4 m between y = 1 and 5 m, in a hall whose wall is at y = 0; the lower wall may be open from 8 to 11 m, and a
+    /// board of 2 m may stand 0.5 m inside the upper one.
     fn corridor(open: bool, board: bool) -> TrackMap {
         let cell = move |column: usize, row: usize| {
             let gap = open && (160..220).contains(&column);
-            let on_board = board && (260..300).contains(&column) && row == 69;
+            let on_board = board && (260..300).contains(&column) && row == 89;
             match (column, row) {
-                (0 | 399, _) | (_, 79) => Cell::Occupied,
-                (_, 0) if !gap => Cell::Occupied,
+                (0 | 399, _) | (_, 0 | 99) => Cell::Occupied,
+                (_, 20) if !gap => Cell::Occupied,
                 _ if on_board => Cell::Occupied,
                 _ => Cell::Free,
             }
         };
-        TrackMap::new(OccupancyGrid::from_fn(400, 80, 0.05, Pose::IDENTITY, cell)).expect("a map")
+        TrackMap::new(OccupancyGrid::from_fn(400, 100, 0.05, Pose::IDENTITY, cell)).expect("a map")
     }
 
     fn scan(world: &TrackMap, at: Pose, seconds: f64) -> Scan {
@@ -302,21 +301,21 @@ mod tests {
         }
     }
 
-    /// Drives up and down so many times; `other` is a world in which the car drives the first time.
+    /// Drives along once in each of these worlds, with this map.
     fn drive(map: &TrackMap, worlds: &[&TrackMap]) -> Vec<Stretch> {
         let mut watch = MapWatch::default();
         let mut found = Vec::new();
         let mut seconds = 0.0;
         for world in worlds {
             for step in 0..170 {
-                let at = Pose::new(1.5 + 0.1 * f64::from(step), 2.0, 0.0);
+                let at = Pose::new(1.5 + 0.1 * f64::from(step), 3.0, 0.0);
                 seconds += 0.1001;
                 found.extend(watch.on_scan(&scan(world, at, seconds), at, map));
             }
             // The way back is out of sight.
             seconds += 10.0;
         }
-        let at = Pose::new(1.5, 2.0, 0.0);
+        let at = Pose::new(1.5, 3.0, 0.0);
         found.extend(watch.on_scan(&scan(map, at, seconds), at, map));
         found
     }
@@ -329,7 +328,7 @@ mod tests {
         let [stretch] = found[..] else { panic!("{found:?}") };
         assert!(stretch.gone && stretch.passes == 2, "{stretch:?}");
         assert!(
-            (stretch.middle[0] - 9.5).abs() < 0.5 && stretch.middle[1].abs() < 0.6,
+            (stretch.middle[0] - 9.5).abs() < 0.5 && (stretch.middle[1] - 1.0).abs() < 0.6,
             "{stretch:?}"
         );
         assert!((stretch.length - 3.0).abs() < 0.8, "{stretch:?}");

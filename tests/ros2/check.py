@@ -694,9 +694,7 @@ def run(part, *arguments):
         check(False, "ended early")
 
 
-PARTS = (hints, bridged, live, clocks, links)
-# Only by name: they have not passed on a quiet machine yet.
-MORE = (gyroscope, sweeps)
+PARTS = (hints, bridged, live, clocks, links, gyroscope, sweeps)
 
 
 def main():
@@ -708,8 +706,8 @@ def main():
         # They have nothing in common, and each waits most of the time.
         threads = [
             threading.Thread(target=run, args=(part, program, folder, track), name=part.__name__)
-            for part in PARTS + MORE
-            if part.__name__ in wanted or (not wanted and part in PARTS)
+            for part in PARTS
+            if not wanted or part.__name__ in wanted
         ]
         for thread in threads:
             thread.start()

@@ -47,7 +47,7 @@ impl SensorModel {
         };
         let table = parameters.sensor.table_parameters();
         #[cfg(feature = "gpu")]
-        if method == RangeMethod::Gpu {
+        if *method == RangeMethod::Gpu {
             return map.gpu().map_or(Ranges::RayMarching, Ranges::Gpu);
         }
         let layout = match (method, region) {

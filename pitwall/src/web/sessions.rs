@@ -5,6 +5,7 @@ use std::path::Path;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use axum::Json;
 use axum::extract::{Query, State};
@@ -20,6 +21,8 @@ use crate::replay::Replay;
 
 /// Most sessions in one answer.
 const MOST: usize = 500;
+/// An index that is nearly up to date is read within this time.
+const BRIEF: Duration = Duration::from_millis(300);
 /// Most replays that are open at a time. The oldest is closed for the next.
 const MOST_REPLAYS: usize = 4;
 
@@ -62,29 +65,31 @@ pub(super) struct SearchQuery {
     text: String,
 }
 
-/// The sessions with these words, as the index has them. It is brought up to date meanwhile: ask again while `reading`.
+/// The sessions with these words, as the index has them. It is brought up to date first. Where that takes long, or another
+/// request has begun it, the answer comes meanwhile: ask again while `reading`.
 pub(super) async fn list(State(app): State<App>, Query(query): Query<SearchQuery>) -> Response {
     let folder = app.recordings.clone();
     let SessionList { reading, fault, .. } = app.session_list.clone();
+    let mut still_reading = true;
     if !reading.swap(true, Ordering::AcqRel) {
         let (folder, fault) = (folder.clone(), fault.clone());
         let skip = app.service.as_ref().and_then(|service| service.recording_path());
-        let reading = reading.clone();
-        tokio::task::spawn_blocking(move || {
+        let refresh = tokio::task::spawn_blocking(move || {
             let outcome =
                 SessionIndex::open(&folder).and_then(|mut index| index.refresh(skip.as_deref(), |_| ()));
             *fault.lock().unwrap_or_else(PoisonError::into_inner) =
                 outcome.err().map(|error| error.to_string());
             reading.store(false, Ordering::Release);
         });
+        still_reading = tokio::time::timeout(BRIEF, refresh).await.is_err();
     }
+    // After the index is up to date, or it is said that it is not yet.
     let found = tokio::task::spawn_blocking(move || search(&folder, &query.text)).await;
     match found {
         Ok(Ok(mut sessions)) => {
             sessions.truncate(MOST);
             let fault = fault.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            let reading = reading.load(Ordering::Acquire);
-            Json(json!({"sessions": sessions, "reading": reading, "fault": fault})).into_response()
+            Json(json!({"sessions": sessions, "reading": still_reading, "fault": fault})).into_response()
         }
         Ok(Err(error)) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),

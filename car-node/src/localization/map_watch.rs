@@ -168,48 +168,60 @@ impl MapWatch {
         wrong.sort_unstable();
         let mut stretches = Vec::new();
         for key in wrong {
-            if let Some(stretch) = self.join(key) {
-                self.found += stretch.length;
-                stretches.push(stretch);
-            }
+            let Some(stretch) = self.join(key, now) else {
+                continue;
+            };
+            self.found += stretch.length;
+            stretches.push(stretch);
         }
         stretches
     }
 
-    /// The stretch around a wrong place; None if it was told already.
-    fn join(&mut self, from: [i32; 2]) -> Option<Stretch> {
+    /// The stretch around a wrong place. None if it was told already, or a part of it is still in view.
+    fn join(&mut self, from: [i32; 2], now: Stamp) -> Option<Stretch> {
         let mut open = vec![from];
-        let (mut low, mut high) = (from, from);
-        let (mut passes, mut gone, mut count) = (0, 0, 0);
+        let mut joined = Vec::new();
         while let Some(key) = open.pop() {
             let Some(place) = self.places.get_mut(&key) else {
                 continue;
             };
+            if now.since(place.seen) < PASSED {
+                joined.iter().for_each(|key| self.tell(key, false));
+                return None;
+            }
             if place.told || !place.is_wrong() {
                 continue;
             }
             place.told = true;
-            passes = passes.max(place.wrong);
-            gone += u32::from(2 * place.gone > place.wrong);
-            count += 1;
-            for axis in 0..2 {
-                low[axis] = low[axis].min(key[axis]);
-                high[axis] = high[axis].max(key[axis]);
-            }
+            joined.push(key);
             for dx in -1..=1 {
                 for dy in -1..=1 {
                     open.push([key[0].saturating_add(dx), key[1].saturating_add(dy)]);
                 }
             }
         }
-        let extent = |axis: usize| f64::from(high[axis] - low[axis] + 1) * PLACE;
-        (count > 0).then(|| Stretch {
-            middle: [0, 1].map(|axis| f64::from(low[axis]) * PLACE + 0.5 * extent(axis)),
-            // A straight wall that runs askew touches a place more than it is long.
-            length: (extent(0) - PLACE).hypot(extent(1) - PLACE).max(PLACE),
-            gone: 2 * gone > count,
-            passes,
+        let places = || joined.iter().filter_map(|key| self.places.get(key));
+        let gone = places().filter(|place| 2 * place.gone > place.wrong).count();
+        let ends = |axis: usize| {
+            let along = joined.iter().map(|key| f64::from(key[axis]) * PLACE);
+            along.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| {
+                (low.min(v), high.max(v))
+            })
+        };
+        let ((left, right), (low, high)) = (ends(0), ends(1));
+        (!joined.is_empty()).then(|| Stretch {
+            middle: [0.5 * (left + right + PLACE), 0.5 * (low + high + PLACE)],
+            // From the middle of the first place to that of the last: walls end in them anywhere.
+            length: (right - left).hypot(high - low).max(PLACE),
+            gone: 2 * gone > joined.len(),
+            passes: places().map(|place| place.wrong).max().unwrap_or_default(),
         })
+    }
+
+    fn tell(&mut self, key: &[i32; 2], told: bool) {
+        if let Some(place) = self.places.get_mut(key) {
+            place.told = told;
+        }
     }
 }
 

@@ -327,8 +327,13 @@ mod tests {
             // The way back is out of sight.
             seconds += 10.0;
         }
+        // Everything is out of sight.
         let at = Pose::new(1.5, 3.0, 0.0);
-        found.extend(watch.on_scan(&scan(map, at, seconds), at, map));
+        let nothing = Scan {
+            range_max: 1.0,
+            ..scan(map, at, seconds)
+        };
+        found.extend(watch.on_scan(&nothing, at, map));
         found
     }
 

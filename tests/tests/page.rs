@@ -385,6 +385,8 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
     browser
         .wait("the marker is in the log", &logged("rain at turn two [ana]"))
         .await;
+    // A value must be beyond its limit for a moment before it is an alarm.
+    tokio::time::sleep(std::time::Duration::from_secs(2)).await;
     browser.key("r").await;
     answer_question(&browser, "Stop the recording?").await;
     browser

@@ -186,7 +186,10 @@ impl MapWatch {
                 continue;
             };
             if now.since(place.seen) < PASSED {
-                joined.iter().for_each(|key| self.tell(key, false));
+                // It is told once it has been passed.
+                for key in joined {
+                    self.tell(key, false);
+                }
                 return None;
             }
             if place.told || !place.is_wrong() {
@@ -218,8 +221,8 @@ impl MapWatch {
         })
     }
 
-    fn tell(&mut self, key: &[i32; 2], told: bool) {
-        if let Some(place) = self.places.get_mut(key) {
+    fn tell(&mut self, key: [i32; 2], told: bool) {
+        if let Some(place) = self.places.get_mut(&key) {
             place.told = told;
         }
     }

@@ -18,8 +18,7 @@ import sys
 import tempfile
 import time
 
-import slow_link
-from slow_link import CAR, PORT, WALL, Lines, Radio, ip
+from slow_link import PORT, WALL, Lines, ip, sides
 
 GOOD = (50e6, 0.002, 0.0)
 # BLIND and live again within this time [s]. A pit wall that restarts needs a moment of its own.
@@ -33,18 +32,7 @@ class Bench:
     def __init__(self, stack, node, wall):
         self.node, self.program = node, wall
         tag = f"lnk{os.getpid() % 10000}"
-        self.car_side, self.wall_side = f"{tag}-car", f"{tag}-wall"
-        self.radio = Radio(tag)
-        for space in (self.car_side, self.wall_side):
-            ip("netns", "add", space)
-            stack.callback(subprocess.run, ["ip", "netns", "del", space], capture_output=True)
-        for name, space, own, other in zip(self.radio.names, (self.car_side, self.wall_side), (CAR, WALL), (WALL, CAR)):
-            ip("link", "set", name, "netns", space)
-            ip("-n", space, "addr", "add", own, "peer", other, "dev", name)
-            ip("-n", space, "link", "set", name, "up")
-            ip("-n", space, "link", "set", "lo", "up")
-            with contextlib.suppress(subprocess.CalledProcessError):
-                ip("netns", "exec", space, "sh", "-c", slow_link.USUAL_CONGESTION_CONTROL)
+        self.radio, self.car_side, self.wall_side = sides(stack, tag)
         self.link(*GOOD)
         self.radio.start()
         self.folder = stack.enter_context(tempfile.TemporaryDirectory())

@@ -30,7 +30,7 @@ from pathlib import Path
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 
-from slow_link import CAR, PORT, WALL, Lines, Radio, ip
+from slow_link import PORT, WALL, Lines, sides
 
 SHORT = [(5, False), (10, True)]
 LONG = [(1200, False), (300, True), (300, False), (60, False), (30, True), (30, False), (5, False)]
@@ -55,16 +55,7 @@ class Session:
     def __init__(self, stack, pitwall, car_node, number):
         self.pitwall, self.car_node = pitwall, car_node
         tag = f"cut{os.getpid() % 10000}{number}"
-        self.car_side, self.wall_side = f"{tag}-car", f"{tag}-wall"
-        self.radio = Radio(tag)
-        for space in (self.car_side, self.wall_side):
-            ip("netns", "add", space)
-            stack.callback(subprocess.run, ["ip", "netns", "del", space], capture_output=True)
-        for name, space, own, other in zip(self.radio.names, (self.car_side, self.wall_side), (CAR, WALL), (WALL, CAR)):
-            ip("link", "set", name, "netns", space)
-            ip("-n", space, "addr", "add", own, "peer", other, "dev", name)
-            ip("-n", space, "link", "set", name, "up")
-            ip("-n", space, "link", "set", "lo", "up")
+        self.radio, self.car_side, self.wall_side = sides(stack, tag)
         self.radio.rate, self.radio.delay, self.radio.loss = GOOD
         self.radio.start()
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))

@@ -130,6 +130,24 @@ class Lines(threading.Thread):
         return None
 
 
+def sides(stack, tag):
+    """A radio between two network namespaces, and their names: the car's and the pit wall's. `stack` removes them."""
+    car_side, wall_side = f"{tag}-car", f"{tag}-wall"
+    radio = Radio(tag)
+    for space in (car_side, wall_side):
+        ip("netns", "add", space)
+        stack.callback(subprocess.run, ["ip", "netns", "del", space], capture_output=True)
+    for name, space, own, other in zip(radio.names, (car_side, wall_side), (CAR, WALL), (WALL, CAR)):
+        ip("link", "set", name, "netns", space)
+        ip("-n", space, "addr", "add", own, "peer", other, "dev", name)
+        ip("-n", space, "link", "set", name, "up")
+        ip("-n", space, "link", "set", "lo", "up")
+        # Whatever this system uses by itself: some get through loss what others do not.
+        with contextlib.suppress(subprocess.CalledProcessError):
+            ip("netns", "exec", space, "sh", "-c", USUAL_CONGESTION_CONTROL)
+    return radio, car_side, wall_side
+
+
 def skip(why):
     print(f"slow link: skipped: {why}")
     return 0
@@ -139,21 +157,9 @@ def main(node, wall):
     if not shutil.which("ip"):
         return skip("no `ip` here (Debian's iproute2)")
     tag = f"slow{os.getpid() % 10000}"
-    car_side, wall_side = f"{tag}-car", f"{tag}-wall"
     with contextlib.ExitStack() as stack:
         try:
-            radio = Radio(tag)
-            for space in (car_side, wall_side):
-                ip("netns", "add", space)
-                stack.callback(subprocess.run, ["ip", "netns", "del", space], capture_output=True)
-            for name, space, own, other in zip(radio.names, (car_side, wall_side), (CAR, WALL), (WALL, CAR)):
-                ip("link", "set", name, "netns", space)
-                ip("-n", space, "addr", "add", own, "peer", other, "dev", name)
-                ip("-n", space, "link", "set", name, "up")
-                ip("-n", space, "link", "set", "lo", "up")
-                # Whatever this system uses by itself: some get through loss what others do not.
-                with contextlib.suppress(subprocess.CalledProcessError):
-                    ip("netns", "exec", space, "sh", "-c", USUAL_CONGESTION_CONTROL)
+            radio, car_side, wall_side = sides(stack, tag)
         except (OSError, subprocess.CalledProcessError) as error:
             return skip(f"no namespaces or TUN devices here: {getattr(error, 'stderr', None) or error}")
         radio.start()

@@ -24,6 +24,8 @@ import tempfile
 import threading
 import time
 
+from links import write
+
 TICKS = os.sysconf("SC_CLK_TCK")
 SCALE = pathlib.Path(__file__).parent.parent / "compose" / "scale"
 # Less than a core for the whole of the largest fleet, and no message lost.
@@ -273,15 +275,6 @@ HEAD = ["| cars | pit wall [cores] | and a page | snapshots/s | recorder [cores]
 def line(row):
     return (f"| {row['cars']} | {row['wall_cores']:.2f} | +{row['page_cores']:.2f} | {row['snapshots_per_s']:.1f} | {row['recorder_cores']:.2f} "
             f"| {row['memory_mb']:.0f} | {row['growth_mb']:+.1f} | {row['missing']} | {row['recorded']} | {row['recorded_missing']} |")
-
-
-def write(path, table):
-    with open(path) as file:
-        text = file.read()
-    before, rest = text.split("<!-- table -->\n", 1)
-    _, after = rest.split("<!-- end -->\n", 1)
-    with open(path, "w") as file:
-        file.write(before + "<!-- table -->\n\n" + "\n".join(table) + "\n\n<!-- end -->\n" + after)
 
 
 def main():

@@ -55,9 +55,13 @@ def check_page():
     # The header stands in golden.rs: it is the whole of a message, and not a payload.
     source = (ROOT / "protocol/tests/wire/golden.rs").read_text()
     golden["header"] = "".join(re.findall(r'"([0-9a-f]+)",', source.split("fn header()")[1].split("fn ")[0]))
-    rows = re.findall(r"^\| `([a-z/]+)` \| (\d+) \|", (ROOT / "docs/wire-format.md").read_text(), re.M)
+    page = (ROOT / "docs/wire-format.md").read_text()
+    rows = re.findall(r"^\| `([a-z/]+)` \| (\d+) \|", page, re.M)
     numbers = {int(number): topic for topic, number in rows}
     check([numbers.get(i) for i in range(len(rows))] == wire.TOPICS, f"the page's {len(rows)} topics are those of the reader")
+    table = page.split("A Cause is kind")[1].split("Metrics are")[0]
+    kinds = sorted(int(number) for number in re.findall(r"\| (\d+) \|", table))
+    check(kinds == list(range(len(wire.CAUSES))), f"the page's {len(kinds)} causes are those of the reader")
     names = []
     for name, partial, digits in documented_bytes():
         names.append(name)
@@ -71,7 +75,7 @@ def check_page():
 
     pose = golden_message("pose", wire.POSE, 1)
     check(pose["pose"] == {"x": 1.5, "y": -2.25, "heading": 0.5} and pose["lap"] == 3, "pose as the page explains it")
-    for version, name, causes in [(2, "health", 41), (1, "health of version 1", 20)]:
+    for version, name, causes in [(2, "health", len(wire.CAUSES)), (1, "health of version 1", 20)]:
         health = golden_message(name, wire.HEALTH, version)
         check(len(health["causes"]) == causes and health["proposal"]["set"] == "lq", f"health of version {version}")
     event = golden_message("event", wire.EVENT, 3)

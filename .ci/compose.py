@@ -1,10 +1,12 @@
-"""compose.yaml on this machine: three green cars, and every container back after `docker kill`.
+"""compose.yaml on this machine: three green cars, and every container back after `docker kill`. Then compose/scale: a car in each of
+two halls, seen at the centre.
 
     python3 .ci/compose.py PATH/TO/car-node PATH/TO/pitwall
 
 The images are made from these binaries and the libraries that they need, so that nothing is downloaded and nothing is compiled.
 Without a Docker daemon one is started as a plain process, and ended afterwards. Where neither is possible (no root, no dockerd, no
-docker-compose) it says so and ends with 0.
+docker-compose) it says so and ends with 0. Where no zenoh image can be had, zenoh's Python package is the router; with neither, the halls
+are left out.
 """
 
 import contextlib
@@ -23,8 +25,11 @@ import tempfile
 import time
 import urllib.request
 
-FILE = os.path.join(os.path.dirname(__file__), "..", "compose", "compose.yaml")
+FOLDER = os.path.join(os.path.dirname(__file__), "..", "compose")
+FILE = os.path.join(FOLDER, "compose.yaml")
+HALLS = os.path.join(FOLDER, "scale", "compose.yaml")
 PROJECT = "pitwall-ci"
+ZENOH = "eclipse/zenoh:1.10.2"
 USER = 65532
 # What a start or a restart may take on a busy machine [s].
 PATIENCE = 180
@@ -112,10 +117,88 @@ def image(name, binary):
     print(f"{name}: {len(tar.getvalue()) / 1e6:.0f} MB")
 
 
-def compose(*words):
+# A router with a configuration file, as zenohd -c. A library has no plugins.
+ROUTER = """
+import sys, threading, zenoh
+config = zenoh.Config.from_file(sys.argv[2])
+config.insert_json5("plugins/storage_manager", "null")
+session = zenoh.open(config)
+threading.Event().wait()
+"""
+
+
+def zenoh_image():
+    """Zenoh's image, or one with its Python package in its place. False when there is neither."""
+    if not subprocess.run(["docker", "image", "inspect", ZENOH], capture_output=True, check=False).returncode:
+        return True
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        if not subprocess.run(["docker", "pull", "-q", ZENOH], capture_output=True, check=False, timeout=60).returncode:
+            return True
+    try:
+        import zenoh  # noqa: PLC0415: it is there or not
+    except ImportError:
+        return False
+    python = os.path.realpath(sys.executable)
+    package, library = os.path.dirname(zenoh.__file__), os.path.dirname(os.__file__)
+    binaries = [python, *(str(path) for folder in (package, f"{library}/lib-dynload") for path in pathlib.Path(folder).glob("*.so"))]
+    needed = {found for binary in binaries for found in re.findall(r"(/\S+) \(0x", run("ldd", binary))}
+
+    def no_cache(entry):
+        return None if "__pycache__" in entry.name or "/test" in entry.name else entry
+
+    tar = io.BytesIO()
+    with tarfile.open(fileobj=tar, mode="w") as archive:
+        for path in sorted(needed | {python}):
+            archive.add(os.path.realpath(path), path.lstrip("/"))
+        archive.add(library, library.lstrip("/"), filter=lambda entry: None if "-packages" in entry.name else no_cache(entry))
+        archive.add(package, "packages/zenoh", filter=no_cache)
+        entry = tarfile.TarInfo("router.py")
+        entry.size = len(ROUTER)
+        archive.addfile(entry, io.BytesIO(ROUTER.encode()))
+    changes = [f'ENTRYPOINT ["{python}", "/router.py"]', "ENV PYTHONPATH=/packages", f"ENV PYTHONHOME={sys.base_prefix}"]
+    words = ["docker", "import", *(word for change in changes for word in ("--change", change)), "-", ZENOH]
+    subprocess.run(words, input=tar.getvalue(), check=True, capture_output=True)
+    return True
+
+
+def halls(car_node, pitwall, folder):
+    """Two halls and a centre: a car in each hall is seen at the centre, also after the centre was killed."""
+    if not zenoh_image():
+        print("compose/scale: left out, neither the image nor the Python package of zenoh is here")
+        return
+    cars = []
+    try:
+        compose("up", "-d", file=HALLS)
+        for name, port in (("hall-a-1", 7451), ("hall-b-1", 7452)):
+            cars.append(subprocess.Popen(
+                [car_node, "run", "--source", "simulator", "--map", "club", "--car", name, "--connect", f"tcp/127.0.0.1:{port}", "--state",
+                 f"{folder}/{name}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+
+        def seen():
+            said = run(pitwall, "cars", "--json", "--insecure", "--connect", "tcp/127.0.0.1:7450", timeout=60)
+            states = {car["car"]: car["state"] for car in json.loads(said)}
+            return states == {"hall-a-1": "LOCALIZED", "hall-b-1": "LOCALIZED"}
+
+        wait("a car in each hall, at the centre", seen)
+        run("docker", "restart", "-t", "1", container("centre"))
+        wait("both cars after the centre's restart", seen)
+        print("two halls: a car in each is seen at the centre, before and after its restart")
+    except SystemExit:
+        for service in ("centre", "hall-a", "hall-b"):
+            print(service, subprocess.run(["docker", "logs", "--tail", "20", container(service)], capture_output=True, text=True, check=False))
+        raise
+    finally:
+        for car in cars:
+            car.kill()
+            car.wait()
+        with contextlib.suppress(Exception):
+            compose("down", "-v", "-t", "1", file=HALLS)
+
+
+def compose(*words, file=FILE):
     tool = ["docker", "compose"] if not subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode \
         else ["docker-compose"]
-    return run(*tool, "-f", FILE, "-p", PROJECT, *words, env={**os.environ, "COMPOSE_PROJECT_NAME": PROJECT})
+    return run(*tool, "-f", file, "-p", PROJECT, *words, env={**os.environ, "COMPOSE_PROJECT_NAME": PROJECT})
 
 
 def container(service):
@@ -180,10 +263,13 @@ def check(folder):
         print(f"three green cars after {time.monotonic() - began:.0f} s")
         for service in SERVICES:
             wait(f"{service} is healthy", lambda service=service: running(service))
-        cars = run("docker", "exec", container("pitwall"), "/usr/local/bin/pitwall", "cars", "--json",
-                   "--keys", "/keys/pit.keys", "--connect", "tls/router:7447")
-        states = [car["state"] for car in json.loads(cars)]
-        assert states == ["LOCALIZED"] * 3, states
+
+        def all_localized():
+            cars = run("docker", "exec", container("pitwall"), "/usr/local/bin/pitwall", "cars", "--json",
+                       "--keys", "/keys/pit.keys", "--connect", "tls/router:7447")
+            return [car["state"] for car in json.loads(cars)] == ["LOCALIZED"] * 3
+
+        wait("three localized cars by the command line", all_localized)
         for service in SERVICES:
             before = json.loads(run("docker", "inspect", container(service)))[0]["State"]["StartedAt"]
             run("docker", "kill", container(service))
@@ -194,6 +280,8 @@ def check(folder):
             print(f"{service}: killed, all green again after {time.monotonic() - began:.0f} s")
         for service in SERVICES:
             assert "PRIVATE KEY" not in run("docker", "logs", container(service)), service
+        compose("down", "-v", "-t", "3")
+        halls(car_node, pitwall, folder)
     finally:
         with contextlib.suppress(Exception):
             compose("down", "-v", "-t", "3")

@@ -133,6 +133,8 @@ pub enum RunEnd {
     Recorded,
     /// The car's own recording was cut off. What it had not brought to its disk is lost, and nobody has it.
     CutOff,
+    /// The car has answered a final sync as it stopped. The run has no further messages.
+    Stopped,
 }
 
 /// Sequence numbers of a stream that were sent and have not been released yet.

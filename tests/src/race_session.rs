@@ -10,7 +10,7 @@ use car_node::localization::LocalizerParameters;
 use car_node::race::{CarResult, Content, PoseSource, Quality, RaceSetup, Transmission, transmitted_race};
 use car_node::stress::Defect;
 use car_node::wire;
-use pitwall::{Delivery, EventPayload, FleetEvent, Recorder, RecordingSummary};
+use pitwall::{Delivery, EventPayload, FleetEvent, Recorder, RecordingSummary, RunEnd};
 use protocol::{
     CarInfo, CarName, Event, MapReply, Message, ParameterSet, Params, Pose2, Stamps, Telemetry, Topic, Value,
     encode,
@@ -94,6 +94,7 @@ impl RaceSession {
                 return Err(fault);
             }
             results.push(heat);
+            session.stop();
             // The cars go to the start again.
             session.begin = session.last + 20_000_000_000;
             session.run_id += 1;
@@ -187,6 +188,20 @@ impl Session {
             self.send(car, Topic::Params, self.begin, self.begin, &params)?;
         }
         Ok(())
+    }
+
+    /// The cars stop, and have confirmed how far their streams go.
+    fn stop(&mut self) {
+        let published = self.last;
+        for car in 0..self.cars.len() {
+            let ends = EventPayload::StreamEnds {
+                run_id: self.run_id,
+                published,
+                end: RunEnd::Stopped,
+                outstanding: Vec::new(),
+            };
+            self.record(car, published, ends);
+        }
     }
 
     fn transmit(&mut self, sent: &Transmission) -> anyhow::Result<()> {

@@ -7,7 +7,7 @@ use std::process::{Child, Command, Stdio};
 
 use pitwall::{EventPayload, FetchOptions, FleetService, RunEnd, read_events};
 use protocol::{Action, CarName, Outcome, RecordAction, Reply, Topic};
-use system_tests::{Link, named, recording, send_command, wait_until};
+use system_tests::{Link, named, recording, send_command, start_real, wait_until};
 
 /// A real node in a process of its own.
 struct CarProcess(Child);
@@ -71,6 +71,40 @@ fn last_file(folder: &Path) -> (usize, u64) {
     files.sort();
     let bytes = files.last().and_then(|file| std::fs::metadata(file).ok());
     (files.len(), bytes.map_or(0, |metadata| metadata.len()))
+}
+
+// Once the laptop's file alone said of a car that was stopped that the end of its run is not known.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_car_that_stops_says_how_far_its_streams_go() {
+    let (endpoint, service, _folder, laptop) = recording().await;
+    let car = named("car-1");
+    for run in 1..=2 {
+        let before = received(&service, &car, Topic::RecordedScan);
+        let node = start_real(&car, 0.0, &endpoint, None);
+        wait_until("a second of scans is at the laptop", || {
+            received(&service, &car, Topic::RecordedScan) > before + 40
+        })
+        .await;
+        if run == 1 {
+            let stop = tokio::task::spawn_blocking(move || node.shutdown("the test stops it"));
+            stop.await.expect("stopped");
+        } else {
+            // The recording ends while it still drives.
+            service
+                .stop_recording()
+                .await
+                .expect("a recording")
+                .expect("good");
+            tokio::task::spawn_blocking(move || node.shutdown("the test is over"))
+                .await
+                .expect("stopped");
+        }
+    }
+    service.close().await;
+    let check = pitwall::check(&laptop).expect("a recording");
+    let ends: Vec<_> = check.cars[0].runs.iter().map(|run| run.end).collect();
+    assert_eq!(ends, [Some(RunEnd::Stopped), Some(RunEnd::Answered)], "{check}");
+    assert!(check.complete, "{check}");
 }
 
 #[tokio::test(flavor = "multi_thread")]

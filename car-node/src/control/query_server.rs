@@ -5,7 +5,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crossbeam_channel::Receiver;
+use crossbeam_channel::{Receiver, Sender};
 use protocol::{MissingRequest, Stamps, Topic, decode, encode};
 
 use super::request::{Request, serve};
@@ -26,6 +26,8 @@ pub struct QueryServer {
     pub shared: Arc<SharedState>,
     /// This run of the node.
     pub run_id: u64,
+    /// Has room for one. Holds something when a pit wall has asked for missing telemetry.
+    pub asked: Sender<()>,
 }
 
 impl QueryServer {
@@ -64,6 +66,8 @@ impl QueryServer {
             sensor: now,
             published: now,
         };
+        // When it is full, it says so already.
+        self.asked.try_send(()).ok();
         encode(&reply, stamps).map_err(|error| error.to_string())
     }
 }

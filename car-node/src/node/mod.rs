@@ -13,9 +13,9 @@ mod run_id;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Sender, bounded};
+use crossbeam_channel::{Receiver, Sender, bounded};
 use keys::Protection;
 use maps::{Pose, Raceline};
 use protocol::{CarInfo, CarName, EventKind, Rates, Stamps, encode};
@@ -166,7 +166,9 @@ pub struct Node {
     /// Dropping these ends the threads that listen to them.
     stop_source: Sender<()>,
     stop_control: Sender<()>,
+    stop_queries: Sender<()>,
     stop_publisher: Sender<()>,
+    asked: Receiver<()>,
     source: JoinHandle<()>,
     filter: JoinHandle<()>,
     command_server: JoinHandle<()>,
@@ -175,7 +177,7 @@ pub struct Node {
     load: JoinHandle<()>,
     local_commands: LocalCommands,
     shadow: JoinHandle<()>,
-    publisher: JoinHandle<()>,
+    publisher: JoinHandle<bool>,
     recorder: Option<RecorderThread>,
     queryables: Vec<Queryable<()>>,
     link_reports: Subscriber<()>,
@@ -185,6 +187,12 @@ pub struct Node {
 
 /// Closing the zenoh session on a dead link takes long; the node waits this long at most.
 const CLOSING: Duration = Duration::from_secs(2);
+/// After a car's last message, a pit wall that listens has this long to ask for what it lacks, ...
+const FIRST_QUERY: Duration = Duration::from_secs(1);
+/// ... then this long for each further query, ...
+const NEXT_QUERY: Duration = Duration::from_millis(400);
+/// ... and this long in all.
+const LAST_QUERIES: Duration = Duration::from_secs(5);
 /// Commands and queries that wait.
 const QUEUE: usize = 64;
 /// Requests for recordings that wait. A pit wall asks for one piece at a time.
@@ -288,6 +296,8 @@ impl Node {
         let (stop_publisher, publisher_stops) = bounded(0);
         let (stop_source, source_stops) = bounded(0);
         let (stop_control, control_stops) = bounded(0);
+        let (stop_queries, queries_stop) = bounded(0);
+        let (on_asked, asked) = bounded(1);
         let (feed, filter_feed) = bounded(sensors::QUEUE);
         let (local_commands, local_requests) = LocalCommands::new(run_id);
         let (to_filter, filter_commands) = bounded(QUEUE);
@@ -389,8 +399,9 @@ impl Node {
             replay_buffer,
             shared: Arc::clone(&shared),
             run_id,
+            asked: on_asked,
         };
-        let query_server = query_server.start(query_requests, control_stops.clone())?;
+        let query_server = query_server.start(query_requests, queries_stop)?;
         let file_server = FileServer {
             recorder: shared.recorder.clone(),
             shared: Arc::clone(&shared),
@@ -426,7 +437,9 @@ impl Node {
             session,
             stop_source,
             stop_control,
+            stop_queries,
             stop_publisher,
+            asked,
             source,
             filter,
             command_server,
@@ -464,6 +477,14 @@ impl Node {
     pub fn shutdown(self, reason: &str) {
         drop(self.stop_source);
         join(self.source);
+        drop(self.stop_control);
+        join(self.command_server);
+        join(self.file_server);
+        // The filter ends with the last sender of commands, which the command server held.
+        join(self.filter);
+        join(self.load);
+        join(self.shadow);
+        // The last message of the run: nothing can follow.
         self.shared.event(
             self.clock.now(),
             0,
@@ -473,16 +494,14 @@ impl Node {
             None,
             None,
         );
-        drop(self.stop_control);
-        join(self.command_server);
-        join(self.query_server);
-        join(self.file_server);
-        // The filter ends with the last sender of commands, which the command server held.
-        join(self.filter);
-        join(self.load);
-        join(self.shadow);
         drop(self.stop_publisher);
-        join(self.publisher);
+        self.asked.try_recv().ok();
+        let heard = join(self.publisher).unwrap_or(false);
+        if heard {
+            await_last_queries(&self.asked);
+        }
+        drop(self.stop_queries);
+        join(self.query_server);
         if let Some(recorder) = self.recorder {
             recorder.shutdown();
         }
@@ -507,10 +526,25 @@ pub fn exposure(connect: &[String], protection: &Protection, search: bool) -> Op
     ))
 }
 
-fn join(thread: JoinHandle<()>) {
+/// Waits for a thread and returns what it returned; None when it has panicked.
+fn join<T>(thread: JoinHandle<T>) -> Option<T> {
     let name = thread.thread().name().unwrap_or_default().to_owned();
-    if thread.join().is_err() {
+    let outcome = thread.join();
+    if outcome.is_err() {
         tracing::error!(thread = name, "a thread has panicked");
+    }
+    outcome.ok()
+}
+
+/// Waits, after the last message, while pit walls ask for what they lack.
+fn await_last_queries(asked: &Receiver<()>) {
+    let until = Instant::now() + LAST_QUERIES;
+    let mut patience = FIRST_QUERY;
+    while asked
+        .recv_timeout(patience.min(until.saturating_duration_since(Instant::now())))
+        .is_ok()
+    {
+        patience = NEXT_QUERY;
     }
 }
 

@@ -88,15 +88,25 @@ impl Publisher {
         })
     }
 
-    /// Starts the thread. When `stop` is dropped, it sends what is queued and ends.
-    pub fn start(mut self, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
+    /// Starts the thread. When `stop` is dropped, it sends what is queued and ends; it returns true when somebody receives the
+    /// car's events.
+    pub fn start(mut self, stop: Receiver<()>) -> std::io::Result<JoinHandle<bool>> {
         thread::Builder::new().name("publisher".into()).spawn(move || {
             while stop.try_recv() == Err(TryRecvError::Empty) {
                 self.shared.telemetry.wait(TICK);
                 self.flush();
             }
             self.flush();
+            self.has_receivers(Topic::Event)
         })
+    }
+
+    fn has_receivers(&self, topic: Topic) -> bool {
+        let status = self
+            .streams
+            .get(&topic)
+            .map(|stream| stream.publisher.matching_status().wait());
+        status.is_some_and(|status| status.is_ok_and(|status| status.matching()))
     }
 
     /// Sends everything that is queued, the pose first.

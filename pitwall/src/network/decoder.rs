@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, select};
-use protocol::{CarName, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
+use protocol::{CarName, EventKind, Header, Key, MissingReply, Resent, Telemetry, Topic, decode, encode};
 use tokio::sync::{mpsc, oneshot, watch};
 use zenoh::qos::Priority;
 use zenoh::sample::{Sample, SampleKind};
@@ -16,7 +16,7 @@ use super::gap_recovery::{GapRecovery, MessageId, MissingQuery, Outstanding};
 use super::query::{first_reply, stamps};
 use super::run_gate::{Rejected, RunGate};
 use crate::clock::unix_now;
-use crate::event::{Delivery, EventPayload, EventSink, FleetEvent, RunEnd};
+use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
 
 /// How often overdue messages and due queries are looked for.
 const TICK: Duration = Duration::from_millis(50);
@@ -243,14 +243,14 @@ impl Decoder {
             self.handle_message(received, true);
         }
         let (released, stream_ends) = self.recovery.answered(&car, header.run_id, &streams, more, at);
-        if let Some(outstanding) = stream_ends {
+        if let Some((end, outstanding)) = stream_ends {
             (self.sink)(FleetEvent {
                 at,
                 car,
                 payload: EventPayload::StreamEnds {
                     run_id: header.run_id,
                     published: header.published,
-                    end: RunEnd::Answered,
+                    end,
                     outstanding,
                 },
             });
@@ -260,8 +260,8 @@ impl Decoder {
         }
     }
 
-    /// Decodes a message and sends the event.
-    fn forward(&self, received: ReceivedMessage) {
+    /// Decodes a message and sends the event. A car that is stopping is asked for the ends of its streams.
+    fn forward(&mut self, received: ReceivedMessage) {
         let ReceivedMessage {
             at,
             delivery,
@@ -269,13 +269,20 @@ impl Decoder {
             bytes,
         } = received;
         let payload = match Telemetry::decode(key.topic, &bytes) {
-            Some(Ok((header, telemetry))) => EventPayload::Message {
-                topic: key.topic,
-                delivery,
-                header,
-                telemetry: Box::new(telemetry),
-                bytes,
-            },
+            Some(Ok((header, telemetry))) => {
+                if let Telemetry::Event(event) = &telemetry
+                    && matches!(event.kind, EventKind::Stopping { .. })
+                {
+                    self.recovery.stopped(&key.car, header.run_id, unix_now());
+                }
+                EventPayload::Message {
+                    topic: key.topic,
+                    delivery,
+                    header,
+                    telemetry: Box::new(telemetry),
+                    bytes,
+                }
+            }
             Some(Err(error)) => EventPayload::Unreadable {
                 topic: key.topic,
                 header: Header::read(&bytes).ok(),

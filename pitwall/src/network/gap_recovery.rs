@@ -13,14 +13,15 @@
 //! record from the page.
 //!
 //! When a recording ends, a final sync asks every car for its last numbers and requests what it had sent by then. Otherwise
-//! the streams would end up to [`POLL`] and [`TRANSIT`] apart.
+//! the streams would end up to [`POLL`] and [`TRANSIT`] apart. A car that stops gets one, too: it answers for a while after its
+//! last message.
 
 use std::collections::BTreeMap;
 
 use protocol::{CarName, Kept, MissingRequest, Topic, Wanted};
 
 use super::reorder_buffer::ReorderBuffer;
-use crate::event::SentRange;
+use crate::event::{RunEnd, SentRange};
 use crate::fleet::Fleet;
 
 /// Period at which a car is asked for its last numbers. A lost message is noticed with the next one or with this \[ns\].
@@ -92,6 +93,8 @@ struct Car<T> {
     due: i64,
     budget: u32,
     final_sync: Option<FinalSync>,
+    /// True when the run has sent its last message.
+    stopped: bool,
 }
 
 /// State of a car's final sync.
@@ -134,6 +137,7 @@ impl<T> Default for Car<T> {
             due: 0,
             budget: BUDGET[0],
             final_sync: None,
+            stopped: false,
         }
     }
 }
@@ -177,8 +181,19 @@ impl<T> GapRecovery<T> {
     }
 
     /// Starts a final sync at `now` \[unix ns\]: asks every car for its last numbers and requests all that it has sent by then.
+    /// A car that has stopped was asked then.
     pub(crate) fn final_sync(&mut self, now: i64) {
-        for car in self.cars.values_mut() {
+        for car in self.cars.values_mut().filter(|car| !car.stopped) {
+            car.final_sync = Some(FinalSync::Requested(now));
+            car.due = 0;
+        }
+    }
+
+    /// Starts a final sync at `now` \[unix ns\] with a car whose run has sent its last message.
+    pub(crate) fn stopped(&mut self, car: &CarName, run_id: u64, now: i64) {
+        let car = self.cars.get_mut(car);
+        if let Some(car) = car.filter(|car| car.run_id == Some(run_id) && !car.stopped) {
+            car.stopped = true;
             car.final_sync = Some(FinalSync::Requested(now));
             car.due = 0;
         }
@@ -275,7 +290,7 @@ impl<T> GapRecovery<T> {
     }
 
     /// Handles the end of a reply at `now` \[unix ns\], after its messages. `kept` is what the car still has. Returns what need
-    /// not be held back any more and, as the answer to a final sync, the ranges that are still to come.
+    /// not be held back any more and, as the answer to a final sync, the end that it gives and the ranges that are still to come.
     pub(crate) fn answered(
         &mut self,
         car: &CarName,
@@ -283,7 +298,7 @@ impl<T> GapRecovery<T> {
         kept: &[Kept],
         more: bool,
         now: i64,
-    ) -> (Vec<T>, Option<Vec<SentRange>>) {
+    ) -> (Vec<T>, Option<(RunEnd, Vec<SentRange>)>) {
         let recorded = self.recorded;
         let Some(car) = self.cars.get_mut(car) else {
             return (Vec::new(), None);
@@ -323,7 +338,12 @@ impl<T> GapRecovery<T> {
             (true, false, _) => now + RETRY,
             (false, _, _) => now + POLL,
         };
-        (out, answers_final_sync.then_some(sent))
+        let end = if car.stopped {
+            RunEnd::Stopped
+        } else {
+            RunEnd::Answered
+        };
+        (out, answers_final_sync.then_some((end, sent)))
     }
 
     /// Notes at `now` \[unix ns\] that nobody has answered a query.
@@ -363,6 +383,9 @@ impl<T> Car<T> {
                     };
                 }
                 self.due = 0;
+                if std::mem::take(&mut self.stopped) {
+                    self.final_sync = None;
+                }
             }
             None => {}
         }
@@ -404,7 +427,7 @@ mod tests {
         now: i64,
         out: Vec<u64>,
         /// The answers to final syncs.
-        sent: Vec<Vec<SentRange>>,
+        ends: Vec<(RunEnd, Vec<SentRange>)>,
     }
 
     impl Harness {
@@ -418,7 +441,7 @@ mod tests {
                 car,
                 now: SECOND,
                 out: Vec::new(),
-                sent: Vec::new(),
+                ends: Vec::new(),
             }
         }
 
@@ -462,7 +485,7 @@ mod tests {
             let more = !sent.is_empty();
             let (out, sent) = self.recovery.answered(&self.car, RUN, &[kept], more, self.now);
             self.out.extend(out);
-            self.sent.extend(sent);
+            self.ends.extend(sent);
             ranges
         }
 
@@ -553,14 +576,43 @@ mod tests {
             from: 3,
             to: 6,
         };
-        assert_eq!(harness.sent, [[sent]]);
+        assert_eq!(harness.ends, [(RunEnd::Answered, vec![sent])]);
         assert_eq!(harness.outstanding(), (0, 3), "3, 5 and 6");
         harness.arrive([7]);
         assert_eq!(harness.outstanding(), (0, 3), "7 was sent after it");
         harness.wait(0.1);
         assert_eq!(harness.ask(1, 9, 9), [[3, 3], [5, 6]]);
-        assert_eq!((harness.outstanding(), harness.sent.len()), ((0, 0), 1));
+        assert_eq!((harness.outstanding(), harness.ends.len()), ((0, 0), 1));
         assert_eq!(harness.out, [1, 2, 3, 4, 5, 6, 7]);
+    }
+
+    #[test]
+    fn a_car_that_stops_is_asked_at_once_and_not_again_when_the_recording_ends() {
+        let mut harness = Harness::new();
+        harness.arrive([1]);
+        harness.ask(1, 1, 0);
+        harness.arrive([2, 4]);
+        let car = harness.car.clone();
+        harness.recovery.stopped(&car, RUN, harness.now);
+        assert_eq!(harness.ask(1, 5, 1), [[3, 3]]);
+        let sent = |from| SentRange {
+            topic: TOPIC,
+            from,
+            to: 5,
+        };
+        assert_eq!(harness.ends, [(RunEnd::Stopped, vec![sent(5)])]);
+        harness.recovery.final_sync(harness.now);
+        assert_eq!(harness.outstanding(), (0, 1), "5");
+        harness.wait(0.1);
+        assert_eq!(harness.ask(1, 5, 0), [] as [[u64; 2]; 0], "it was on its way");
+        harness.wait(0.1);
+        assert_eq!(harness.ask(1, 5, 1), [[5, 5]]);
+        assert_eq!(harness.out, [1, 2, 3, 4, 5]);
+        assert_eq!(harness.outstanding(), (0, 0));
+        // Its next run is asked when the recording ends.
+        harness.arrive_in(RUN + 1, [1]);
+        harness.recovery.final_sync(harness.now);
+        assert_eq!(harness.outstanding(), (1, 0));
     }
 
     #[test]

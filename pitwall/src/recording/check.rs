@@ -260,6 +260,7 @@ impl fmt::Display for RunCheck {
         write!(f, "  run {run_id}, {from_s:.3} s to {to_s:.3} s: ")?;
         match (end, next_s) {
             (Some(RunEnd::Answered), _) => writeln!(f, "the car has confirmed the end"),
+            (Some(RunEnd::Stopped), _) => writeln!(f, "the car has stopped, and has confirmed the end"),
             (Some(RunEnd::Recorded), _) => writeln!(f, "the car's own recording confirms the end"),
             (Some(RunEnd::CutOff), _) => writeln!(
                 f,

@@ -40,6 +40,8 @@ pub(crate) struct RunSurvey {
     offset: Option<i64>,
     /// How it is known that nothing follows; None where it is not.
     pub(crate) end: Option<RunEnd>,
+    /// When the car stopped, by its own clock \[unix ns\]; None where it has not said so.
+    stopped: Option<i64>,
 }
 
 /// One stream.
@@ -164,13 +166,14 @@ pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
             }
             RawEvent::Note(Note::StreamEnds {
                 run_id,
+                published,
                 end,
                 outstanding,
-                ..
             }) => {
                 let runs = survey.runs.entry(car.clone()).or_default();
                 if let Some(run) = runs.iter_mut().rev().find(|run| run.run_id == run_id) {
                     run.end = Some(end);
+                    run.stopped = (end == RunEnd::Stopped).then_some(published);
                 }
                 for SentRange { topic, from, to } in outstanding {
                     let stream = survey.streams.entry((car.clone(), topic)).or_default();
@@ -262,12 +265,17 @@ impl Survey {
                     published: [published; 2],
                     offset: self.early_offsets.remove(&(car.clone(), run_id)),
                     end: None,
+                    stopped: None,
                 });
             } else if let Some(last) = runs.last_mut() {
                 last.end = None;
             }
             return;
         };
+        if run.stopped.is_some_and(|stopped| published > stopped) {
+            // It had not stopped.
+            (run.end, run.stopped) = (None, None);
+        }
         let [from, to] = run.published;
         run.published = [from.min(published), to.max(published)];
     }

@@ -11,7 +11,7 @@ use super::foxglove::{self, Exported};
 use super::note::Note;
 use super::session::Session;
 use super::summary::{RecordingSummary, StreamSummary};
-use crate::event::{EventPayload, FleetEvent, SentRange};
+use crate::event::{EventPayload, FleetEvent, RunEnd, SentRange};
 use crate::fleet::{SequenceStatus, SequenceTracker};
 
 /// Encoding of messages that are stored as received.
@@ -43,6 +43,8 @@ pub(super) struct RecordingWriter<W: Write + Seek> {
     streams: BTreeMap<Key, RecordedStream>,
     /// The end of each car that has answered the final sync.
     ends: BTreeMap<CarName, End>,
+    /// The end of each car whose last run has stopped. Another run may follow.
+    stopped: BTreeMap<CarName, End>,
     /// What the JSON channels of each car have.
     exported: BTreeMap<CarName, ExportedTimes>,
     /// Each car's clock minus the laptop's \[ns\], and the run in which they were compared, if that is known.
@@ -62,6 +64,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
             schemas: HashMap::new(),
             streams: BTreeMap::new(),
             ends: BTreeMap::new(),
+            stopped: BTreeMap::new(),
             exported: BTreeMap::new(),
             offsets: BTreeMap::new(),
             notes: 0,
@@ -117,6 +120,13 @@ impl<W: Write + Seek> RecordingWriter<W> {
                 {
                     return false;
                 }
+                if self
+                    .stopped
+                    .get(car)
+                    .is_some_and(|&(run_id, end)| run_id != header.run_id || end < header.published)
+                {
+                    self.stopped.remove(car);
+                }
                 if stream.until.0 != published.0 || stream.until.1 < published.1 {
                     stream.until = published;
                 }
@@ -124,10 +134,14 @@ impl<W: Write + Seek> RecordingWriter<W> {
             EventPayload::StreamEnds {
                 run_id,
                 published,
+                end,
                 outstanding,
-                ..
             } => {
-                self.ends.insert(car.clone(), (*run_id, *published));
+                let ends = match end {
+                    RunEnd::Stopped => &mut self.stopped,
+                    _ => &mut self.ends,
+                };
+                ends.insert(car.clone(), (*run_id, *published));
                 for SentRange { topic, from, to } in outstanding {
                     let stream = self.streams.entry(Key::new(car.clone(), *topic)).or_default();
                     stream.gaps.sent(*run_id, *from, *to);
@@ -235,13 +249,24 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.writer.flush()
     }
 
+    /// The end of each car that has one.
+    fn known_ends(&self) -> BTreeMap<CarName, End> {
+        let mut ends = self.stopped.clone();
+        ends.extend(self.ends.iter().map(|(car, end)| (car.clone(), *end)));
+        ends
+    }
+
+    fn has_end(&self, car: &CarName) -> bool {
+        self.ends.contains_key(car) || self.stopped.contains_key(car)
+    }
+
     /// Content of the file so far.
     pub(super) fn summary(&self) -> RecordingSummary {
-        let mut ends = self.ends.clone();
+        let mut ends = self.known_ends();
         for (key, stream) in &self.streams {
             let end = ends.entry(key.car.clone()).or_insert(stream.until);
             // Without a final sync, the end is the latest message of any topic.
-            if !self.ends.contains_key(&key.car) && (end.0 != stream.until.0 || end.1 < stream.until.1) {
+            if !self.has_end(&key.car) && (end.0 != stream.until.0 || end.1 < stream.until.1) {
                 *end = stream.until;
             }
         }
@@ -275,7 +300,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
         let mut summary = self.summary();
         let mut cars: Vec<_> = self.streams.keys().map(|key| key.car.clone()).collect();
         cars.dedup();
-        cars.retain(|car| !self.ends.contains_key(car));
+        cars.retain(|car| !self.has_end(car));
         summary.unanswered = cars;
         complete(&mut self.writer, &summary, &self.session)?;
         Ok((summary, self.writer.into_inner()))

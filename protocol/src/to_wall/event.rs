@@ -56,7 +56,7 @@ pub enum EventKind {
         /// Its version.
         version: String,
     },
-    /// The node is about to stop.
+    /// The node stops. This is the last message of its run; it answers queries for missing messages for a while.
     Stopping {
         /// Why.
         reason: String,

@@ -4,18 +4,19 @@
 //! the car has published them, with the time at which they would have arrived. Live poses and health messages are left out
 //! where the full-rate streams have them, because those are complete.
 //!
-//! The file is read twice. The first pass finds the messages that are late and keeps their bytes; the second one hands
-//! them out before the messages that were published after them.
+//! The file is read twice. The first pass reads the headers, finds the messages that are late and keeps their bytes; the second one
+//! hands them out before the messages that were published after them. Only the whole file says whether the full-rate streams have the
+//! live messages. The first pass assumes that they do; where one of them does not, another pass finds what is late.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, HashSet, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::{CarName, Header, Topic};
+use protocol::{CarName, Header, Telemetry, Topic};
 
 use super::error::RecordingError;
 use super::reader::{Recording, payload, read_events};
-use super::survey::{Survey, survey};
+use super::survey::{Survey, full_rate, survey_with};
 use crate::event::{EventPayload, FleetEvent};
 use crate::fleet::Fleet;
 
@@ -30,12 +31,23 @@ struct Late {
 /// The newest message of a car's run so far.
 type Newest = BTreeMap<(CarName, u64), i64>;
 
+/// The late messages of each car's run.
+type LateByRun = BTreeMap<(CarName, u64), LateMessages>;
+
+/// The late messages of one run.
+#[derive(Default)]
+struct LateMessages {
+    /// In the order of publishing.
+    queue: VecDeque<Late>,
+    /// Topic, sequence number and time of publishing of each.
+    ids: HashSet<(Topic, u64, i64)>,
+}
+
 /// The wanted events of a recording in the order of publishing. The first error is the last item.
 pub struct InOrder {
     survey: Survey,
     events: Recording,
-    newest: Newest,
-    late: BTreeMap<(CarName, u64), VecDeque<Late>>,
+    late: LateByRun,
     /// The car's clock minus the laptop's in each of its runs \[ns\].
     offsets: BTreeMap<(CarName, u64), i64>,
     ready: VecDeque<FleetEvent>,
@@ -45,40 +57,59 @@ pub struct InOrder {
 
 /// Reads the events of a recording whose topic is wanted, and all that are not messages.
 pub fn read_in_order(path: &Path, wanted: fn(Topic) -> bool) -> Result<InOrder, RecordingError> {
-    let survey = survey(path)?;
-    let mut late = BTreeMap::<_, VecDeque<Late>>::new();
-    let mut newest = Newest::default();
-    for event in read_events(path)?.only(wanted) {
-        let event = event?;
-        let Some((topic, header, bytes)) = message(&event) else {
-            continue;
-        };
-        if survey.is_copy(&event.car, topic) || !is_late(&mut newest, &event.car, header) {
-            continue;
-        }
-        let stream = late.entry((event.car.clone(), header.run_id)).or_default();
-        stream.push_back(Late {
-            published: header.published,
-            topic,
-            sequence: header.sequence,
-            bytes: Arc::clone(bytes),
-        });
+    let (survey, mut late) = find_late(path, wanted, |_, topic| full_rate(topic).is_some())?;
+    let cars = survey.cars();
+    let assumed = |(car, topic): (&CarName, Topic)| full_rate(topic).is_none() || survey.is_copy(car, topic);
+    if !cars
+        .iter()
+        .flat_map(|car| survey.of(car).map(move |(topic, _)| (car, topic)))
+        .all(assumed)
+    {
+        (_, late) = find_late(path, wanted, |car, topic| survey.is_copy(car, topic))?;
     }
     for messages in late.values_mut() {
         messages
+            .queue
             .make_contiguous()
             .sort_by_key(|late| (late.published, late.topic, late.sequence));
     }
     Ok(InOrder {
         survey,
         events: read_events(path)?.only(wanted),
-        newest: Newest::default(),
         late,
         offsets: BTreeMap::new(),
         ready: VecDeque::new(),
         ended: false,
         copies: false,
     })
+}
+
+/// Reads the headers of a recording, and finds the wanted messages that are late. Copies are left out.
+fn find_late(
+    path: &Path,
+    wanted: fn(Topic) -> bool,
+    is_copy: impl Fn(&CarName, Topic) -> bool,
+) -> Result<(Survey, LateByRun), RecordingError> {
+    let mut late = LateByRun::new();
+    let mut newest = Newest::default();
+    let survey = survey_with(path, |car, topic, header, bytes| {
+        if !wanted(topic) || is_copy(car, topic) || !is_late(&mut newest, car, header) {
+            return;
+        }
+        if Telemetry::decode(topic, &bytes).is_none_or(|decoded| decoded.is_err()) {
+            // What cannot be decoded is told where it stands.
+            return;
+        }
+        let late = late.entry((car.clone(), header.run_id)).or_default();
+        late.ids.insert((topic, header.sequence, header.published));
+        late.queue.push_back(Late {
+            published: header.published,
+            topic,
+            sequence: header.sequence,
+            bytes: bytes.into(),
+        });
+    })?;
+    Ok((survey, late))
 }
 
 /// The message of an event, if it is one.
@@ -138,7 +169,7 @@ impl InOrder {
             let Some(event) = self.events.next().transpose()? else {
                 self.ended = true;
                 for (run, messages) in std::mem::take(&mut self.late) {
-                    for late in messages {
+                    for late in messages.queue {
                         let event = self.event_of(&run, &late, i64::MAX);
                         self.ready.extend(event);
                     }
@@ -168,15 +199,16 @@ impl InOrder {
             }
             return;
         }
-        if is_late(&mut self.newest, &event.car, header) {
-            return;
-        }
         let (run_id, published) = (header.run_id, header.published);
         let key = (event.car.clone(), run_id);
+        let id = (topic, header.sequence, published);
+        if self.late.get(&key).is_some_and(|late| late.ids.contains(&id)) {
+            return;
+        }
         while let Some(late) = self
             .late
             .get_mut(&key)
-            .and_then(|late| late.pop_front_if(|late| late.published < published))
+            .and_then(|late| late.queue.pop_front_if(|late| late.published < published))
         {
             let event = self.event_of(&key, &late, event.at);
             self.ready.extend(event);

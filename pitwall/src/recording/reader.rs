@@ -1,14 +1,17 @@
 //! Reads a recording: the same events as the live pit wall had.
 //!
 //! A message that cannot be decoded is an event, too ([`EventPayload::Unreadable`]), as it is live. Channels of other
-//! programs are skipped with a warning.
+//! programs are skipped with a warning. A thread reads and decompresses ahead, so that this and what the events are for take turns
+//! on two cores.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs::File;
 use std::io::{ErrorKind, Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::{io, thread};
 
+use crossbeam_channel::{Receiver, bounded};
 use mcap::records::{Channel, MessageHeader};
 use protocol::{CarName, Header, Key, MapReply, Telemetry, Topic, decode};
 
@@ -21,7 +24,7 @@ use crate::event::{Delivery, EventPayload, FleetEvent};
 /// The events of a recording, in the order in which they were written. The first error is the last item.
 pub struct Recording {
     path: PathBuf,
-    salvage: Salvage<File>,
+    source: Source,
     /// Records that are read and not yet handled.
     records: VecDeque<Salvaged>,
     channels: BTreeMap<u16, Channel>,
@@ -37,6 +40,14 @@ pub struct Recording {
     wanted: fn(Topic) -> bool,
 }
 
+/// Where the records come from.
+enum Source {
+    /// The file, before the first record.
+    File(File),
+    /// The thread that reads it: one record, or all those of a chunk. The last ones are empty.
+    Thread(Receiver<io::Result<Vec<Salvaged>>>),
+}
+
 /// A message or a note, not decoded.
 #[derive(Debug)]
 pub(super) enum RawEvent {
@@ -44,8 +55,7 @@ pub(super) enum RawEvent {
         topic: Topic,
         /// None where it is damaged.
         header: Option<Header>,
-        /// Length.
-        bytes: usize,
+        bytes: Vec<u8>,
     },
     Note(Note),
 }
@@ -67,7 +77,7 @@ pub fn read_events(path: &Path) -> Result<Recording, RecordingError> {
     let file = open(path)?;
     Ok(Recording {
         path: path.to_owned(),
-        salvage: Salvage::new(file).map_err(|e| RecordingError::io(path, e))?,
+        source: Source::File(file),
         records: VecDeque::new(),
         channels: BTreeMap::new(),
         progress: Progress::Data,
@@ -96,12 +106,13 @@ pub(super) fn read_raw(
             .next_with(|channel, encoding, data, _| {
                 if encoding == WIRE_ENCODING {
                     let key = channel.parse::<Key>().map_err(|e| e.to_string())?;
-                    let header = Header::read(data).ok();
-                    let (topic, bytes) = (key.topic, data.len());
+                    let header = Header::read(&data).ok();
+                    let topic = key.topic;
                     let carries = Telemetry::carried_by(topic);
-                    return Ok(carries.then_some((RawEvent::Message { topic, header, bytes }, key.car)));
+                    let message = |bytes| RawEvent::Message { topic, header, bytes };
+                    return Ok(carries.then(|| (message(data), key.car)));
                 }
-                note(channel, data).map(|note| note.map(|(note, car)| (RawEvent::Note(note), car)))
+                note(channel, &data).map(|note| note.map(|(note, car)| (RawEvent::Note(note), car)))
             })
             .transpose();
         if !matches!(next, Some(Ok(_))) {
@@ -163,9 +174,9 @@ impl Recording {
     fn next_event(&mut self) -> Result<Option<FleetEvent>, RecordingError> {
         let next = self.next_with(|channel, encoding, data, wanted| {
             if encoding == WIRE_ENCODING {
-                return wire_message(channel, data, wanted);
+                return wire_message(channel, &data, wanted);
             }
-            note(channel, data).map(|note| note.map(|(note, car)| (note.into(), car)))
+            note(channel, &data).map(|note| note.map(|(note, car)| (note.into(), car)))
         })?;
         Ok(next.map(|(at, car, payload)| FleetEvent { at, car, payload }))
     }
@@ -173,7 +184,7 @@ impl Recording {
     /// The next message that `decode` makes something of.
     fn next_with<P>(
         &mut self,
-        decode: impl Fn(&str, &str, &[u8], fn(Topic) -> bool) -> Decoded<P>,
+        decode: impl Fn(&str, &str, Vec<u8>, fn(Topic) -> bool) -> Decoded<P>,
     ) -> Result<Option<(i64, CarName, P)>, RecordingError> {
         while self.progress != Progress::Done {
             let Some(record) = self.next_record()? else {
@@ -184,7 +195,7 @@ impl Recording {
                     self.channels.insert(channel.id, channel);
                 }
                 Salvaged::Message(header, data) => {
-                    if let Some((payload, car)) = self.decoded(&header, &data, &decode)? {
+                    if let Some((payload, car)) = self.decoded(&header, data, &decode)? {
                         return Ok(Some((header.log_time as i64, car, payload)));
                     }
                 }
@@ -207,7 +218,7 @@ impl Recording {
     /// The next record; None at an end that is missing and passed over.
     fn next_record(&mut self) -> Result<Option<Salvaged>, RecordingError> {
         if self.records.is_empty() {
-            let records = self.salvage.next(true);
+            let records = self.next_records();
             self.records = records.map_err(|e| RecordingError::io(&self.path, e))?.into();
         }
         match (self.records.pop_front(), &self.passed_over) {
@@ -219,12 +230,24 @@ impl Recording {
         }
     }
 
+    /// The next record, or all those of a chunk; none at the end of the file.
+    fn next_records(&mut self) -> io::Result<Vec<Salvaged>> {
+        if let Source::File(file) = &self.source {
+            self.source = Source::Thread(read_ahead(file.try_clone()?, self.wanted)?);
+        }
+        match &self.source {
+            // It has ended.
+            Source::Thread(records) => records.recv().unwrap_or_else(|_| Ok(Vec::new())),
+            Source::File(_) => Ok(Vec::new()),
+        }
+    }
+
     /// What a message holds; None for one that is not wanted, and for one for other programs.
     fn decoded<P>(
         &mut self,
         header: &MessageHeader,
-        data: &[u8],
-        decode: impl Fn(&str, &str, &[u8], fn(Topic) -> bool) -> Decoded<P>,
+        data: Vec<u8>,
+        decode: impl Fn(&str, &str, Vec<u8>, fn(Topic) -> bool) -> Decoded<P>,
     ) -> Result<Option<(P, CarName)>, RecordingError> {
         let Some(channel) = self.channels.get(&header.channel_id) else {
             let reason = format!("a message is on the unknown channel {}", header.channel_id);
@@ -248,6 +271,31 @@ impl Recording {
             }
         }
     }
+}
+
+/// Starts the thread that reads a file. It ends with the file, with an error, or when nobody takes the records any more.
+fn read_ahead(file: File, wanted: fn(Topic) -> bool) -> io::Result<Receiver<io::Result<Vec<Salvaged>>>> {
+    // The next chunk is decompressed while this one is used. More would be kept in memory for nothing.
+    let (records, taken) = bounded(0);
+    // Foreign channels of the protocol's encoding stay, so that they are reported.
+    let mut salvage = Salvage::new(file)?.only(move |channel| {
+        let foreign = channel.message_encoding != WIRE_ENCODING;
+        match channel.topic.parse::<Key>() {
+            _ if foreign => Note::car(&channel.topic).is_some(),
+            Ok(key) => wanted(key.topic),
+            Err(_) => true,
+        }
+    });
+    thread::Builder::new().name("recording".into()).spawn(move || {
+        loop {
+            let next = salvage.next(true);
+            let last = next.as_ref().map_or(true, Vec::is_empty);
+            if records.send(next).is_err() || last {
+                return;
+            }
+        }
+    })?;
+    Ok(taken)
 }
 
 /// The note on a channel; None on a channel for other programs.

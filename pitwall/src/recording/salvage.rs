@@ -5,6 +5,7 @@
 //! and against [`RECORD_LIMIT`] before memory is allocated.
 
 use std::borrow::Borrow;
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt;
@@ -49,6 +50,36 @@ pub(super) struct Salvage<F> {
     file: F,
     len: u64,
     at: u64,
+    filter: Filter,
+}
+
+/// Leaves out the messages of some channels, before they are copied.
+struct Filter {
+    wanted: Box<dyn Fn(&Channel) -> bool + Send>,
+    unwanted: BTreeSet<u16>,
+}
+
+impl Filter {
+    /// Notes a channel, and passes its record on.
+    fn note(&mut self, record: Option<Salvaged>) -> Option<Salvaged> {
+        if let Some(Salvaged::Channel(channel)) = &record {
+            if (self.wanted)(channel) {
+                self.unwanted.remove(&channel.id);
+            } else {
+                self.unwanted.insert(channel.id);
+            }
+        }
+        record
+    }
+
+    /// True for a message that is left out.
+    fn leaves_out(&self, opcode: u8, body: &[u8]) -> bool {
+        opcode == op::MESSAGE
+            && !self.unwanted.is_empty()
+            && body
+                .first_chunk()
+                .is_some_and(|channel| self.unwanted.contains(&u16::from_le_bytes(*channel)))
+    }
 }
 
 impl<F: Borrow<File>> Salvage<F> {
@@ -58,7 +89,17 @@ impl<F: Borrow<File>> Salvage<F> {
             len: file.borrow().metadata()?.len(),
             file,
             at: MAGIC.len() as u64,
+            filter: Filter {
+                wanted: Box::new(|_| true),
+                unwanted: BTreeSet::new(),
+            },
         })
+    }
+
+    /// Leaves out the messages of channels that are not wanted.
+    pub(super) fn only(mut self, wanted: impl Fn(&Channel) -> bool + Send + 'static) -> Self {
+        self.filter.wanted = Box::new(wanted);
+        self
     }
 
     /// The next records: one, or all those of a chunk. Empty at the end of the file. Chunks are skipped without
@@ -79,9 +120,15 @@ impl<F: Borrow<File>> Salvage<F> {
             self.at = end;
             if opcode == op::CHUNK {
                 if chunks {
-                    return Ok(read_chunk(&body));
+                    let records = read_chunk(&body, &mut self.filter);
+                    // Empty is the end of the file.
+                    if !records.is_empty() {
+                        return Ok(records);
+                    }
                 }
-            } else if let Some(record) = parse(opcode, body) {
+            } else if !self.filter.leaves_out(opcode, &body)
+                && let Some(record) = self.filter.note(parse(opcode, &body))
+            {
                 return Ok(vec![record]);
             }
         }
@@ -279,12 +326,13 @@ fn is_exact(opcode: u8) -> bool {
 }
 
 /// A record outside chunks; None for one that the writer makes anew.
-fn parse(opcode: u8, body: Vec<u8>) -> Option<Salvaged> {
+fn parse(opcode: u8, body: &[u8]) -> Option<Salvaged> {
     use mcap::records::Record;
     if opcode >= 0x80 {
-        return Some(Salvaged::Private { opcode, data: body });
+        let data = body.to_vec();
+        return Some(Salvaged::Private { opcode, data });
     }
-    let record = match mcap::parse_record(opcode, &body) {
+    let record = match mcap::parse_record(opcode, body) {
         Ok(record) => record,
         Err(error) => return Some(Salvaged::Damage(error.to_string())),
     };
@@ -311,7 +359,7 @@ fn parse(opcode: u8, body: Vec<u8>) -> Option<Salvaged> {
 }
 
 /// The records of a chunk. A chunk with a wrong checksum gives none; one without a checksum gives those before the fault.
-fn read_chunk(body: &[u8]) -> Vec<Salvaged> {
+fn read_chunk(body: &[u8], filter: &mut Filter) -> Vec<Salvaged> {
     let options = LinearReaderOptions::default()
         .with_record_length_limit(RECORD_LIMIT)
         .with_prevalidate_chunk_crcs(true)
@@ -331,7 +379,9 @@ fn read_chunk(body: &[u8]) -> Vec<Salvaged> {
             }
             Ok(LinearReadEvent::Record { opcode, data }) => {
                 if after_fields(opcode, data).is_some() {
-                    records.extend(parse(opcode, data.to_vec()));
+                    if !filter.leaves_out(opcode, data) {
+                        records.extend(filter.note(parse(opcode, data)));
+                    }
                 } else {
                     let text = format!("a record of kind {opcode} in a chunk is damaged");
                     records.push(Salvaged::Damage(text));

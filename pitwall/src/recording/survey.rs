@@ -120,6 +120,14 @@ impl StreamSurvey {
 
 /// Reads the headers of a whole recording.
 pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
+    survey_with(path, |_, _, _, _| ())
+}
+
+/// Reads the headers of a whole recording, and passes on each message with an intact one.
+pub(super) fn survey_with(
+    path: &Path,
+    mut pass_on: impl FnMut(&CarName, Topic, &Header, Vec<u8>),
+) -> Result<Survey, RecordingError> {
     /// A message that takes this much longer than the fastest was recovered \[ns\].
     const LATE: i64 = 1_000_000_000;
     let mut survey = Survey::default();
@@ -134,7 +142,7 @@ pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
         match event {
             RawEvent::Message { topic, header, bytes } => {
                 let stream = survey.streams.entry((car.clone(), topic)).or_default();
-                stream.bytes += bytes as u64;
+                stream.bytes += bytes.len() as u64;
                 let Some(header) = header else {
                     stream.unreadable += 1;
                     continue;
@@ -147,10 +155,11 @@ pub(crate) fn survey(path: &Path) -> Result<Survey, RecordingError> {
                 if topic != Topic::Event {
                     let begun = survey
                         .begun
-                        .entry((car, header.run_id))
+                        .entry((car.clone(), header.run_id))
                         .or_insert(header.published);
                     *begun = header.published.min(*begun);
                 }
+                pass_on(&car, topic, &header, bytes);
             }
             RawEvent::Note(Note::Unreadable { topic, header, .. }) => {
                 let stream = survey.streams.entry((car, topic)).or_default();

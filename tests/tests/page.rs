@@ -11,9 +11,10 @@
 use std::process::{Child, Command, Stdio};
 use std::sync::LazyLock;
 
+use car_node::race::Quality;
 use pitwall::{Fleet, PageOptions, PitWallOptions, PitWallServer, read_events};
 use serde_json::Value;
-use system_tests::{Behaviour, Browser, FakeCar, free_endpoint, router, wait_until};
+use system_tests::{Behaviour, Browser, FakeCar, RaceSession, free_endpoint, router, wait_until};
 use tokio::sync::{Mutex, MutexGuard};
 
 /// Held by the test that runs, so that only one uses the processor.
@@ -539,6 +540,159 @@ async fn a_recording_is_replayed_on_the_same_page() {
     browser
         .wait("it has jumped back", &format!("pitwall.snapshot.epoch > {epoch}"))
         .await;
+    browser.expect_clean(page.url()).await;
+    browser.close().await;
+    page.stop().await;
+    replay.stop();
+    drop(guard);
+}
+
+/// The numbers in a text, in their order.
+fn numbers_in(text: &str) -> Vec<f64> {
+    let parts = text.split(|c: char| !(c.is_ascii_digit() || c == '.'));
+    parts.filter_map(|part| part.parse().ok()).collect()
+}
+
+/// The page shows a race with the figures of `car-node race --json`. The report is compared in `race_figures.rs`.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_race_has_the_same_figures_on_the_page() {
+    /// Times are shown to a millisecond. The car times its laps by its own pose: the line is passed up to a centimetre early or
+    /// late \[s\].
+    const TIME_S: f64 = 5.5e-3;
+    let guard = ONE_AT_A_TIME.lock().await;
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("race.mcap");
+    let session = RaceSession {
+        track: "club".into(),
+        cars: 2,
+        heats: vec![("hq".into(), Quality::Hq, 3), ("lq".into(), Quality::Hq, 3)],
+        seed: 3,
+        defects: Vec::new(),
+        scans: false,
+    };
+    let heats = {
+        let (session, file) = (session.clone(), file.clone());
+        let recorded = tokio::task::spawn_blocking(move || session.record(&file)).await;
+        recorded.expect("no panic").expect("a recording").0
+    };
+    let replay = pitwall::Replay::start(&file).expect("a good file");
+    replay
+        .set_playback(Some(false), None, Some(1e6))
+        .expect("its end");
+    let options = PageOptions {
+        address: ([127, 0, 0, 1], 0).into(),
+        ..PageOptions::default()
+    };
+    let page = pitwall::Page::serve_replay(replay.clone(), options)
+        .await
+        .expect("a page");
+    let browser = Browser::open(page.url(), 1366, 768).await;
+    browser.key("l").await;
+    let rows = |table: &str| {
+        format!(
+            "[...document.querySelectorAll('#{table} tr')].slice(1).map((row) => [...row.cells].map((cell) => [cell.innerText, cell.title]))"
+        )
+    };
+    let near = |what: &str, shown: f64, raced: f64, tolerance: f64| {
+        assert!(
+            (shown - raced).abs() <= tolerance,
+            "{what}: {shown} is shown, {raced} was raced"
+        );
+    };
+    for index in 0..2 {
+        let car = format!("car-{}", index + 1);
+        browser
+            .wait(
+                "the car is in the standings",
+                "document.querySelectorAll('#standings tbody tr').length === 2",
+            )
+            .await;
+        browser
+            .evaluate(&format!(
+                "[...document.querySelectorAll('#standings tbody tr')].find((row) => row.innerText.includes('{car}')).click()"
+            ))
+            .await;
+        let its_laps = format!(
+            "document.querySelector('#laps th')?.innerText === '{car}' && document.querySelectorAll('#laps tr').length > 4"
+        );
+        browser.wait("its laps", &its_laps).await;
+        let mut laps = browser
+            .evaluate(&rows("laps"))
+            .await
+            .as_array()
+            .cloned()
+            .expect("rows");
+        laps.reverse();
+        let text = |lap: &Value, cell: usize| lap[cell][0].as_str().unwrap_or_default().to_owned();
+        let mut best = f64::INFINITY;
+        for ((set, ..), heat) in session.heats.iter().zip(&heats) {
+            let raced = &heat[index];
+            let shown: Vec<_> = laps.iter().filter(|lap| text(lap, 6) == *set).collect();
+            // The race ends when the last car is over the line, before that car's own pose is.
+            assert!(shown.len() + 1 >= raced.laps.len(), "{car} on {set}: {shown:#?}");
+            let mut alignments = Vec::new();
+            for (shown, raced) in shown.iter().zip(&raced.laps) {
+                let who = format!("{car} on {set}, lap {}", text(shown, 0));
+                let time = numbers_in(&text(shown, 1))[0];
+                near(&format!("{who}, time"), time, raced.time_s, TIME_S);
+                best = best.min(raced.time_s);
+                let sectors: f64 = (3..6).map(|cell| numbers_in(&text(shown, cell))[0]).sum();
+                near(&format!("{who}, sectors"), sectors, raced.time_s, TIME_S + 0.015);
+                // "worst slip 3 %, mean alignment 97 %, mean distance from the raceline 5.1 cm"
+                let about = numbers_in(shown[7][1].as_str().unwrap_or_default());
+                near(
+                    &format!("{who}, off the line"),
+                    about[2] * 1e-2,
+                    raced.line_error_m,
+                    1.5e-3,
+                );
+                alignments.push(about[1] * 1e-2);
+            }
+            let alignment = alignments.iter().sum::<f64>() / alignments.len() as f64;
+            near(
+                &format!("{car} on {set}, alignment"),
+                alignment,
+                raced.alignment.expect("known"),
+                0.01,
+            );
+        }
+        let standings = browser
+            .evaluate(&rows("standings"))
+            .await
+            .as_array()
+            .cloned()
+            .expect("rows");
+        let row = standings.iter().find(|row| text(row, 1) == car).expect("its row");
+        near(
+            &format!("{car}, best lap"),
+            numbers_in(&text(row, 2))[0],
+            best,
+            TIME_S,
+        );
+
+        // The analysis lists the same laps.
+        let listed = format!(
+            "pitwall.analysis.view.laps.filter((lap) => lap.car === '{car}' && lap.time_s !== null).map((lap) => lap.time_s)"
+        );
+        browser.key("d").await;
+        browser
+            .wait("the analysis", "pitwall.analysis?.view?.laps.length > 6")
+            .await;
+        let listed: Vec<_> = browser
+            .evaluate(&listed)
+            .await
+            .as_array()
+            .expect("times")
+            .iter()
+            .map(number)
+            .collect();
+        let in_table: Vec<_> = laps.iter().map(|lap| numbers_in(&text(lap, 1))[0]).collect();
+        assert_eq!(listed.len(), in_table.len(), "{listed:?}, {in_table:?}");
+        for (listed, in_table) in listed.iter().zip(&in_table) {
+            near(&format!("{car}, lap in the analysis"), *listed, *in_table, 2e-3);
+        }
+        browser.key("l").await;
+    }
     browser.expect_clean(page.url()).await;
     browser.close().await;
     page.stop().await;

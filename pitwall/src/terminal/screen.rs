@@ -94,6 +94,8 @@ fn loop_until(
         if key.kind == KeyEventKind::Release {
             continue;
         }
+        // An answer that was read makes room for the keys.
+        shown.answer.take_if(|(done, _)| done.is_some());
         match shown.press(key) {
             KeyAction::Nothing => {}
             KeyAction::Quit => return Ok(()),

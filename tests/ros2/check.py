@@ -272,7 +272,8 @@ def check_outputs(observer, car, namespace=""):
     for topic in ("/pf/viz/inferred_pose", "/tracked_pose", "/tracked_pose/with_covariance"):
         messages = observer.all(namespace + topic)
         inner = (lambda m: m.pose.pose) if topic.endswith("covariance") else (lambda m: m.pose)
-        same = [inner(m) == by_stamp.get(peer.stamp_of(m)) for m in messages]
+        # Later ones came after the poses were looked at.
+        same = [inner(m) == by_stamp.get(peer.stamp_of(m)) for m in messages if peer.stamp_of(m) <= stamps[-1]]
         check(len(same) > 20 and sum(same) >= len(same) - 2 and messages[-1].header.frame_id == "map", f"{topic} is the same pose")
     transforms = [m.transforms[0] for m in observer.all(f"{namespace}/tf")]
     frames = {(t.header.frame_id, t.child_frame_id) for t in transforms}
@@ -396,7 +397,11 @@ def check_initial_poses(observer, ros, car):
         since = time.monotonic()
         answered = wait(lambda: (send_pose(ros, "/initialpose", frame, x, 0.0, 0.0), time.sleep(0.2), any(word in line for line in observer.log(since)))[-1])
         check(answered, f"an initial pose is refused on /rosout: {word}")
-    check(observer.localized(), "and the car stays localized")
+    # A busy machine publishes poses late, which degrades them for a moment.
+    check(wait(observer.localized), "and the car stays localized")
+    since = time.monotonic()
+    wait(lambda: len(errors(observer, car, "/pf/pose/odom", since)) > 20)
+    check_poses(observer, car, "", since, "refused poses move nothing")
 
 
 def check_parameters(observer, call, namespace=""):

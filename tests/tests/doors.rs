@@ -392,6 +392,7 @@ async fn a_flood_of_commands_is_named_and_others_are_served() {
         .await
         .expect("let in");
     let key = Key::new(car.clone(), Topic::CmdAuto).to_string();
+    let began = std::time::Instant::now();
     for number in 0..1000_u32 {
         let mut flood = command("mallory", Action::Auto(number % 2 == 0));
         flood.id = CommandId(u128::from(number) + 1);
@@ -418,7 +419,9 @@ async fn a_flood_of_commands_is_named_and_others_are_served() {
         .since(0)
         .filter(|entry| entry.text.contains("not signed"))
         .count();
-    assert!(refused < 100, "{refused} events");
+    // Twenty a second are answered and told, for as long as this machine took to send them.
+    let answered = 20.0 * (began.elapsed().as_secs_f64() + 3.0);
+    assert!((refused as f64) < answered, "{refused} of {answered:.0} events");
     node.shutdown("the test is over");
     wall.close().await;
 }

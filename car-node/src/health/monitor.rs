@@ -725,8 +725,13 @@ mod tests {
     }
 
     #[test]
-    fn an_opponent_in_view_does_not_even_degrade() {
-        for share in [0.3, 0.6, 0.9] {
+    fn an_opponent_in_view_degrades_once_too_few_beams_are_left() {
+        for (share, expected) in [
+            (0.3, &[State::Localized][..]),
+            (0.5, &[State::Localized]),
+            (0.6, &[State::Localized, State::Degraded]),
+            (0.9, &[State::Localized, State::Degraded]),
+        ] {
             let mut drive = Drive::localized();
             let states = drive.drive(3.0, |update| {
                 update.short_beams = share;
@@ -734,7 +739,7 @@ mod tests {
                 update.residual = 0.05 + 0.6 * share;
                 update.w_ratio = 0.3;
             });
-            assert_eq!(states, [State::Localized]);
+            assert_eq!(states, expected, "{share}");
             assert_eq!(drive.kinds(), [CauseKind::Occluded, CauseKind::Likelihood]);
         }
     }

@@ -198,9 +198,32 @@ fn in_doubt(doubt: Doubt, t: &Thresholds) -> Finding {
     }
 }
 
-/// Metrics that warn, and never degrade the state.
+/// Others fill the view. The state is degraded once too few beams are left to confirm the pose.
+fn occluded(evidence: &Evidence<'_>, t: &Thresholds) -> Option<Finding> {
+    let Evidence { slow, fast, good, .. } = evidence;
+    let found = hint(
+        CauseKind::Occluded,
+        Severity::Info,
+        fast.blocked(),
+        t.blocked_some,
+    )?;
+    let margin = if *good { 0.0 } else { t.hysteresis };
+    let degrades = slow.alignment < t.confirming_least + margin;
+    let severity = if degrades {
+        Severity::Warning
+    } else {
+        found.severity
+    };
+    Some(Finding {
+        severity,
+        degrades,
+        ..found
+    })
+}
+
+/// Metrics that warn; only an occluded view degrades the state.
 fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
-    use CauseKind::{EffectiveSampleSize, Likelihood, NoReturn, Occluded, Slip, YawRate};
+    use CauseKind::{EffectiveSampleSize, Likelihood, NoReturn, Slip, YawRate};
     let m = evidence.metrics;
     let below = |kind, value: f64, limit: f64| {
         (value < limit).then_some(Finding {
@@ -217,7 +240,7 @@ fn hints(evidence: &Evidence<'_>, t: &Thresholds) -> [Option<Finding>; 6] {
         hint(Slip, Severity::Warning, m.slip, t.slip_severe)
             .or_else(|| hint(Slip, Severity::Info, m.slip, t.slip)),
         hint(YawRate, Severity::Info, m.yaw_rate_residual, t.yaw_rate_residual),
-        hint(Occluded, Severity::Info, evidence.fast.blocked(), t.blocked_some),
+        occluded(evidence, t),
         hint(NoReturn, Severity::Info, m.no_return, t.no_return_info),
         below(EffectiveSampleSize, m.ess_ratio, t.ess_info),
         below(Likelihood, m.w_ratio, t.w_ratio_info),

@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 ///
 /// They come from the failure criteria of `als_ros`, and from right and wrong poses on logs. On five drives of real cars a
 /// right pose has a [clear alignment](Self::alignment_degraded) of 0.66 to 1.00. A wrong one on the map of a building has
-/// 0.29. Filters without recovery, carried to another place of a club track, have 0.1 to 0.5 in the seconds after. `car-node evaluate --fault` measures the same on any log.
+/// 0.29. Filters without recovery, carried to another place of a club track, have 0.1 to 0.5 in the seconds after.
+/// `car-node evaluate --fault` measures the same on any log.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Thresholds {
@@ -31,6 +32,9 @@ pub struct Thresholds {
     pub blocked_some: f64,
     /// Share of blocked beams above this leaves too few to judge the pose, in [0, 1].
     pub blocked_most: f64,
+    /// Where beams are blocked and a smaller share of all beams than this lies on walls, the scan tells a right pose from a wrong
+    /// one no longer, and the state is degraded, in [0, 1]. Wrong poses have as much.
+    pub confirming_least: f64,
     /// Share of beams without a return above this is reported, in [0, 1].
     pub no_return_info: f64,
     /// Effective sample size over the number of particles below this is reported. It never degrades the state: with slipping
@@ -98,6 +102,7 @@ impl Default for Thresholds {
             long_beams: 0.15,
             blocked_some: 0.15,
             blocked_most: 0.80,
+            confirming_least: 0.42,
             no_return_info: 0.30,
             ess_info: 0.05,
             w_ratio_info: 0.8,

@@ -4,7 +4,7 @@ use maps::Pose;
 use nalgebra::Matrix2;
 
 use crate::branch_and_bound::SearchWindow;
-use crate::frozen_map::FrozenMap;
+use crate::frozen_map::Walls;
 use crate::graph::MapMatch;
 use crate::nonlinear_matcher::{MatchWeights, nonlinear_match, shape_of_information};
 use crate::parameters::PoseGraphParameters;
@@ -20,12 +20,12 @@ pub(crate) enum Search {
 
 /// The best match of a node's end points with the frozen map, refined; None if it is too bad.
 pub(crate) fn match_with_map(
-    map: &FrozenMap,
+    walls: &Walls,
     points: &[[f32; 2]],
     search: Search,
     parameters: &PoseGraphParameters,
 ) -> Option<MapMatch> {
-    let stack = map.stack(parameters.branch_and_bound_depth);
+    let stack = walls.stack(parameters.branch_and_bound_depth);
     let found = match search {
         Search::Around(pose) => {
             let window = SearchWindow {
@@ -42,9 +42,9 @@ pub(crate) fn match_with_map(
         rotation: parameters.constraint_rotation_weight,
         max_num_iterations: parameters.constraint_max_num_iterations,
     };
-    let pose = nonlinear_match(&map.grid, points, found.pose, found.pose, weights);
+    let pose = nonlinear_match(&walls.grid, points, found.pose, found.pose, weights);
     let shape = if parameters.match_weights_by_information {
-        shape_of_information(&map.grid, points, pose)
+        shape_of_information(&walls.grid, points, pose)
     } else {
         Matrix2::identity()
     };

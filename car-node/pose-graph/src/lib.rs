@@ -16,6 +16,7 @@
 //! | real-time correlative scan matcher | `correlative_matcher.rs` |
 //! | non-linear scan matcher | `nonlinear_matcher.rs` |
 //! | constraint builder with branch and bound | `constraint_builder.rs`, `branch_and_bound.rs` |
+//! | offset of the map's walls | `wall_offset.rs`, `frozen_map.rs` |
 //! | pose graph, trimming, optimization | `graph.rs`, `optimization.rs`, `back_end.rs` |
 //! | parameters, a team's Lua file | `parameters.rs`, `lua.rs` |
 //!
@@ -77,6 +78,7 @@ mod submap;
 #[cfg(test)]
 mod test_room;
 mod voxel_filter;
+mod wall_offset;
 
 pub use frozen_map::FrozenMap;
 pub use lua::LuaConfiguration;

@@ -13,7 +13,7 @@ use nalgebra::Matrix3;
 
 use crate::back_end::{BackEndOutcome, BackEndWork, PendingMatch};
 use crate::constraint_builder::Search;
-use crate::frozen_map::FrozenMap;
+use crate::frozen_map::{FrozenMap, Walls};
 use crate::graph::Graph;
 use crate::local_trajectory_builder::{LocalMatch, LocalTrajectoryBuilder};
 use crate::match_errors::MatchErrors;
@@ -23,6 +23,7 @@ use crate::range_data::Points;
 use crate::sampler::FixedRatioSampler;
 use crate::slip::SlipMeter;
 use crate::voxel_filter::adaptive_voxel_filter;
+use crate::wall_offset::WallOffset;
 
 /// Why a localizer could not be set up.
 #[derive(Debug, thiserror::Error)]
@@ -68,6 +69,8 @@ const AVERAGED_OVER: [f64; 2] = [0.5, 5.0];
 #[derive(Debug)]
 pub struct PoseGraph {
     map: Arc<FrozenMap>,
+    walls: Arc<Walls>,
+    wall_offset: WallOffset,
     base_link_from_laser: Pose,
     parameters: PoseGraphParameters,
     extrapolator: PoseExtrapolator,
@@ -113,6 +116,8 @@ impl PoseGraph {
         Ok(Self {
             local: LocalTrajectoryBuilder::new(0, &parameters),
             graph: Graph::new(Pose::IDENTITY, 0),
+            walls: map.walls(0),
+            wall_offset: WallOffset::default(),
             map,
             base_link_from_laser,
             parameters,
@@ -184,6 +189,8 @@ impl PoseGraph {
         BackEndWork {
             number: self.works,
             map: Arc::clone(&self.map),
+            walls: Arc::clone(&self.walls),
+            wall_offset: self.wall_offset,
             graph: self.graph.clone(),
             pending: std::mem::take(&mut self.pending),
             optimize,
@@ -197,6 +204,8 @@ impl PoseGraph {
         }
         self.in_flight = None;
         self.graph.adopt(&outcome.graph);
+        self.walls = Arc::clone(&outcome.walls);
+        self.wall_offset = outcome.wall_offset;
         for matched in &outcome.matches {
             if self.mode == Mode::Searching {
                 self.errors = MatchErrors::default();

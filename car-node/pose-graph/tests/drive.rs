@@ -18,30 +18,35 @@ fn radius(angle: f64) -> f64 {
     7.0 + 0.7 * (2.0 * angle).sin() + 0.35 * (5.0 * angle + 1.0).cos() + 0.3 * (3.0 * angle).cos()
 }
 
-/// A ring 2.4 m wide on a grid of 5 cm whose origin is turned.
+/// A ring of this half width [m] on a grid of 5 cm whose origin is turned.
+fn ring(half_width: f64) -> Arc<OccupancyGrid> {
+    let cells = (0..400 * 400).map(|i| {
+        let [x, y] = [i % 400, i / 400].map(|v| (f64::from(v) + 0.5) * 0.05 - 10.0);
+        let off = x.hypot(y) - radius(y.atan2(x));
+        if off.abs() < half_width {
+            Cell::Free
+        } else {
+            Cell::Occupied
+        }
+    });
+    let origin = Pose::new(0.0, 0.0, 0.5) * Pose::new(-10.0, -10.0, 0.0);
+    Arc::new(OccupancyGrid::new(400, 400, 0.05, origin, cells.collect()))
+}
+
+/// What the laser sees.
 fn grid() -> &'static Arc<OccupancyGrid> {
     static GRID: OnceLock<Arc<OccupancyGrid>> = OnceLock::new();
-    GRID.get_or_init(|| {
-        let cells = (0..400 * 400).map(|i| {
-            let [x, y] = [i % 400, i / 400].map(|v| (f64::from(v) + 0.5) * 0.05 - 10.0);
-            let off = x.hypot(y) - radius(y.atan2(x));
-            if off.abs() < 1.2 {
-                Cell::Free
-            } else {
-                Cell::Occupied
-            }
-        });
-        let origin = Pose::new(0.0, 0.0, 0.5) * Pose::new(-10.0, -10.0, 0.0);
-        Arc::new(OccupancyGrid::new(400, 400, 0.05, origin, cells.collect()))
-    })
+    GRID.get_or_init(|| ring(1.2))
+}
+
+fn frozen(grid: &Arc<OccupancyGrid>) -> Arc<FrozenMap> {
+    let field = Arc::new(DistanceField::new(grid));
+    Arc::new(FrozenMap::new(Arc::clone(grid), field))
 }
 
 fn map() -> Arc<FrozenMap> {
     static MAP: OnceLock<Arc<FrozenMap>> = OnceLock::new();
-    Arc::clone(MAP.get_or_init(|| {
-        let field = Arc::new(DistanceField::new(grid()));
-        Arc::new(FrozenMap::new(Arc::clone(grid()), field))
-    }))
+    Arc::clone(MAP.get_or_init(|| frozen(grid())))
 }
 
 fn stamp(seconds: f64) -> Stamp {
@@ -89,8 +94,11 @@ fn scan(seconds: f64) -> Scan {
 }
 
 fn localizer(name: &str) -> PoseGraph {
-    let set = PoseGraphParameters::named(name).expect("ships");
-    PoseGraph::new(map(), BASE_LINK_FROM_LASER, set).expect("sound")
+    on_map(map(), &PoseGraphParameters::named(name).expect("ships"))
+}
+
+fn on_map(map: Arc<FrozenMap>, set: &PoseGraphParameters) -> PoseGraph {
+    PoseGraph::new(map, BASE_LINK_FROM_LASER, set.clone()).expect("sound")
 }
 
 /// Follows the car, with scans at 25 Hz and odometry at 50; calls back after each scan.
@@ -116,7 +124,10 @@ fn error(update: &Update) -> f64 {
 }
 
 fn started(name: &str) -> PoseGraph {
-    let mut localizer = localizer(name);
+    start(localizer(name))
+}
+
+fn start(mut localizer: PoseGraph) -> PoseGraph {
     localizer.on_odometry(&odometry(-0.02, 1.0)).expect("sound");
     localizer.initialize(truth(-0.02)).expect("on the map");
     localizer
@@ -155,6 +166,48 @@ fn the_same_log_gives_the_same_poses_bit_for_bit() {
         poses
     };
     assert_eq!(run(), run());
+}
+
+#[test]
+fn a_worker_that_is_in_time_changes_no_pose() {
+    let run = |worker: bool| {
+        let (mut localizer, mut poses) = (started("pose-graph-tuned"), Vec::new());
+        drive(&mut localizer, 0.0..2.0, 1.05, |localizer, update| {
+            poses.push(update.clone());
+            if worker && let Some(job) = localizer.take_job() {
+                let outcome = std::thread::spawn(job).join().expect("it ends");
+                localizer.finish_job(outcome);
+            }
+        });
+        poses
+    };
+    assert_eq!(run(true), run(false));
+}
+
+#[test]
+fn walls_that_are_drawn_too_near_do_not_hold_the_car_back() {
+    // A laser that looks ahead takes them for a place farther back.
+    let drawn = frozen(&ring(1.13));
+    let off = |wall_offset_distance: f64| {
+        let set = PoseGraphParameters {
+            wall_offset_distance,
+            ..PoseGraphParameters::named("pose-graph-tuned").expect("ships")
+        };
+        let (mut squares, mut count) = (0.0, 0.0);
+        let mut localizer = start(on_map(Arc::clone(&drawn), &set));
+        drive(&mut localizer, 0.0..6.0, 1.0, |_, update| {
+            if update.stamp.since(stamp(2.0)) > 0.0 {
+                squares += error(update).powi(2);
+                count += 1.0;
+            }
+        });
+        f64::sqrt(squares / count)
+    };
+    let (taken_as_drawn, learned) = (off(0.0), off(3.0));
+    assert!(
+        taken_as_drawn > 0.04 && learned < 0.02,
+        "{taken_as_drawn} {learned}"
+    );
 }
 
 #[test]

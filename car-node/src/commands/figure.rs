@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use maps::Pose;
-use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 use simulator::Track;
-use synpf::parts::{RangeCaster, RangeSource, beam_density, moved_particles, weighed_beams};
+use synpf::parts::{
+    RangeCaster, RangeSource, beam_density, free_lasers, moved_particles, ranges_to_faces, weighed_beams,
+};
 use synpf::{BeamLayout, BeamParameters, MotionModel, MotionParameters, Parameters, TrackMap};
 
 use super::plot::{Axis, COLOURS, Figure};
@@ -59,7 +59,7 @@ fn motion_models() -> String {
             );
             let cloud = moved_particles(&parameters, &vec![step; steps], PARTICLES, 1);
             // Both models at one speed have one scale, the same along and across.
-            let reach = if column == 0 { 0.7 } else { 4.2 };
+            let reach = if column == 0 { 0.7 } else { 5.6 };
             let [width, height] = [490.0 - 78.0, 330.0 - 82.0];
             let half = reach * height / width / 2.0;
             let mut panel = figure.panel(
@@ -234,65 +234,18 @@ fn sensor_model() -> anyhow::Result<String> {
     Ok(figure.svg())
 }
 
-/// Rays for comparing range methods: from free cells at least 0.2 m from a wall, at the centre of no cell.
-fn rays(map: &TrackMap, count: usize, seed: u64) -> Vec<Pose> {
-    let mut random = SmallRng::seed_from_u64(seed);
-    let grid = map.grid();
-    let size = [grid.width as f64, grid.height as f64].map(|cells| cells * grid.resolution);
-    let mut rays = Vec::with_capacity(count);
-    // A map may have little free space, but `TrackMap` refuses one with none.
-    for _ in 0..1000 * count {
-        let at = Pose::new(
-            random.random_range(0.0..size[0]),
-            random.random_range(0.0..size[1]),
-            random.random_range(-PI..PI),
-        );
-        let laser = grid.origin * at;
-        let free = grid.at([laser.x, laser.y]) == maps::Cell::Free;
-        if free && map.distance([laser.x, laser.y]) > 0.2 {
-            rays.push(laser);
-            if rays.len() == count {
-                break;
-            }
-        }
-    }
-    rays
-}
-
-/// The range to the first face along a ray, by cutting the ray with every face \[m\].
-fn range_to_face(map: &TrackMap, faces: &[[[f32; 2]; 2]], laser: Pose) -> Option<f64> {
-    let resolution = map.grid().resolution;
-    let at = map.grid().origin.inverse() * laser;
-    let (sin, cos) = at.heading.sin_cos();
-    let turned = |p: [f32; 2]| {
-        let (dx, dy) = (
-            f64::from(p[0]) - at.x / resolution,
-            f64::from(p[1]) - at.y / resolution,
-        );
-        [dx * cos + dy * sin, dy * cos - dx * sin]
-    };
-    faces
-        .iter()
-        .filter_map(|face| {
-            let [a, b] = face.map(turned);
-            let crosses = (a[1] < 0.0) != (b[1] < 0.0);
-            crosses.then(|| a[0] - a[1] * (b[0] - a[0]) / (b[1] - a[1]))
-        })
-        .filter(|range| *range > 0.0)
-        .reduce(f64::min)
-        .map(|range| range * resolution)
-}
-
 /// The distribution of each method's range error on a bundled track.
 fn range_methods() -> anyhow::Result<String> {
     const RAYS: usize = 2500;
     const LONGEST: f64 = 20.0;
     let track = Track::bundled("club").context("the track club")?;
     let map = Arc::new(TrackMap::new(track.grid)?);
-    let faces = map.field().contour();
-    let (rays, truth): (Vec<Pose>, Vec<f64>) = rays(&map, RAYS, 1)
+    let rays = free_lasers(&map, RAYS, 1);
+    let truth = ranges_to_faces(&map, &rays);
+    let (rays, truth): (Vec<Pose>, Vec<f64>) = rays
         .into_iter()
-        .filter_map(|ray| Some((ray, range_to_face(&map, &faces, ray)?)))
+        .zip(truth)
+        .filter_map(|(ray, range)| Some((ray, range?)))
         .filter(|(_, range)| *range < LONGEST)
         .unzip();
     let mut figure = Figure::new([980.0, 470.0], "Error of predicted ranges on club, cells of 5 cm");

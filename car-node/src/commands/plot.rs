@@ -261,7 +261,7 @@ impl Panel<'_> {
         }
         let longest = self.legend.iter().map(|(name, _)| name.chars().count()).max();
         let (w, h) = (
-            34.0 + 7.0 * longest.unwrap_or(0) as f64,
+            36.0 + 7.3 * longest.unwrap_or(0) as f64,
             10.0 + 18.0 * self.legend.len() as f64,
         );
         let (x, y) = (

@@ -5,17 +5,14 @@
 //! Times are the least of several runs on one thread; the graphics card's driver uses what it likes.
 #![allow(clippy::print_stdout, reason = "a benchmark prints its results")]
 
-use std::f64::consts::PI;
 use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use maps::{Cell, OccupancyGrid, Pose};
-use rand::rngs::SmallRng;
-use rand::{RngExt, SeedableRng};
 use synpf::TrackMap;
-use synpf::parts::{RangeCaster, RangeSource, ScanWeigher};
+use synpf::parts::{RangeCaster, RangeSource, ScanWeigher, free_lasers, ranges_to_faces};
 
 /// Rays whose errors are measured, and whose times.
 const MEASURED: usize = 1000;
@@ -95,49 +92,6 @@ fn least_time(mut run: impl FnMut()) -> f64 {
     }
 }
 
-/// Rays from free places at least 0.2 m from a wall.
-fn rays(map: &TrackMap, count: usize) -> Vec<Pose> {
-    let mut random = SmallRng::seed_from_u64(1);
-    let grid = map.grid();
-    let size = [grid.width as f64, grid.height as f64].map(|cells| cells * grid.resolution);
-    let mut rays = Vec::with_capacity(count);
-    while rays.len() < count {
-        let at = Pose::new(
-            random.random_range(0.0..size[0]),
-            random.random_range(0.0..size[1]),
-            random.random_range(-PI..PI),
-        );
-        let laser = grid.origin * at;
-        if grid.at([laser.x, laser.y]) == Cell::Free && map.distance([laser.x, laser.y]) > 0.2 {
-            rays.push(laser);
-        }
-    }
-    rays
-}
-
-/// The range to the first face along a ray, by cutting it with every face \[m\].
-fn range_to_face(grid: &OccupancyGrid, faces: &[[[f32; 2]; 2]], laser: Pose) -> Option<f64> {
-    let at = grid.origin.inverse() * laser;
-    let (sin, cos) = at.heading.sin_cos();
-    let turned = |p: [f32; 2]| {
-        let (dx, dy) = (
-            f64::from(p[0]) - at.x / grid.resolution,
-            f64::from(p[1]) - at.y / grid.resolution,
-        );
-        [dx * cos + dy * sin, dy * cos - dx * sin]
-    };
-    faces
-        .iter()
-        .filter_map(|face| {
-            let [a, b] = face.map(turned);
-            let crosses = (a[1] < 0.0) != (b[1] < 0.0);
-            crosses.then(|| a[0] - a[1] * (b[0] - a[0]) / (b[1] - a[1]))
-        })
-        .filter(|range| *range > 0.0)
-        .reduce(f64::min)
-        .map(|range| range * grid.resolution)
-}
-
 fn ranges(name: &str, grid: &OccupancyGrid) {
     let size = [grid.width, grid.height];
     let free = grid.cells.iter().filter(|cell| **cell == Cell::Free).count();
@@ -150,11 +104,10 @@ fn ranges(name: &str, grid: &OccupancyGrid) {
         "method", "build, ms", "memory, MB", "ray, ns", "cloud, ns", "median, cm", "99 %, cm"
     );
     let map = Arc::new(TrackMap::new(grid.clone()).expect("free space"));
-    let faces = map.field().contour();
-    let rays = rays(&map, TIMED);
-    let truth: Vec<Option<f64>> = rays[..MEASURED]
-        .iter()
-        .map(|ray| range_to_face(grid, &faces, *ray).filter(|range| *range < LONGEST))
+    let rays = free_lasers(&map, TIMED, 1);
+    let truth: Vec<Option<f64>> = ranges_to_faces(&map, &rays[..MEASURED])
+        .into_iter()
+        .map(|range| range.filter(|range| *range < LONGEST))
         .collect();
     let in_the_middle = *rays
         .iter()
@@ -215,7 +168,7 @@ fn ranges(name: &str, grid: &OccupancyGrid) {
 /// The time to weigh a scan of 21 beams, by the number of particles.
 fn particles() {
     let map = Arc::new(TrackMap::new(club()).expect("free space"));
-    let at = *rays(&map, 1000)
+    let at = *free_lasers(&map, 1000, 1)
         .iter()
         .max_by(|a, b| map.distance([a.x, a.y]).total_cmp(&map.distance([b.x, b.y])))
         .expect("some rays");

@@ -1,9 +1,11 @@
 //! Single parts of the filter on their own: for figures, benchmarks and comparisons. A localizer needs none of this.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
-use maps::{Pose, wrap_angle};
+use maps::{Cell, Pose, wrap_angle};
+use rand::rngs::SmallRng;
+use rand::{RngExt, SeedableRng};
 
 use crate::beam_layout::{BeamParameters, MOST_BEAMS, chosen_beams};
 use crate::beam_model::BeamModel;
@@ -42,6 +44,49 @@ pub fn weighed_beams(count: usize, angle_min: f64, increment: f64, parameters: &
 /// last one is no return. Without the exponent of `squash_factor`.
 pub fn beam_density(parameters: &SensorParameters, predicted: f64) -> Vec<[f64; 2]> {
     BeamModel::new(parameters).density(predicted, parameters.squash_factor)
+}
+
+/// Lasers for comparing range sources: at random places in free cells, at least 0.2 m from a wall, facing anywhere. Fewer than
+/// `count` where there is hardly such a place.
+pub fn free_lasers(map: &TrackMap, count: usize, seed: u64) -> Vec<Pose> {
+    let mut random = SmallRng::seed_from_u64(seed);
+    let grid = map.grid();
+    let size = [grid.width, grid.height].map(|cells| cells as f64 * grid.resolution);
+    let anywhere = (0..1000 * count).map(|_| {
+        let [x, y] = size.map(|length| random.random_range(0.0..length));
+        grid.origin * Pose::new(x, y, random.random_range(-PI..PI))
+    });
+    let free =
+        |laser: &Pose| grid.at([laser.x, laser.y]) == Cell::Free && map.distance([laser.x, laser.y]) > 0.2;
+    anywhere.filter(free).take(count).collect()
+}
+
+/// What range sources are compared with: the range of each laser along its x axis to the first face of a wall \[m\], by cutting the
+/// ray with every face; None for a ray that meets none.
+pub fn ranges_to_faces(map: &TrackMap, lasers: &[Pose]) -> Vec<Option<f64>> {
+    let faces = map.field().contour();
+    let resolution = map.grid().resolution;
+    let range = |laser: &Pose| {
+        let at = map.grid_from_map() * *laser;
+        let (sin, cos) = at.heading.sin_cos();
+        // In a frame that has the ray along its x axis.
+        let turned = |p: [f32; 2]| {
+            let dx = f64::from(p[0]) - at.x / resolution;
+            let dy = f64::from(p[1]) - at.y / resolution;
+            [dx * cos + dy * sin, dy * cos - dx * sin]
+        };
+        faces
+            .iter()
+            .filter_map(|face| {
+                let [a, b] = face.map(turned);
+                let crosses = (a[1] < 0.0) != (b[1] < 0.0);
+                crosses.then(|| a[0] - a[1] * (b[0] - a[0]) / (b[1] - a[1]))
+            })
+            .filter(|range| *range > 0.0)
+            .reduce(f64::min)
+            .map(|range| range * resolution)
+    };
+    lasers.iter().map(range).collect()
 }
 
 /// What predicts ranges.

@@ -251,6 +251,7 @@ def errors(observer, car, topic, since):
 
 
 def check_poses(observer, car, namespace, since, what):
+    wait(lambda: len(errors(observer, car, f"{namespace}/pf/pose/odom", since)) > 20)
     found = errors(observer, car, f"{namespace}/pf/pose/odom", since)
     mean = sum(found) / max(len(found), 1)
     check(len(found) > 20 and mean < NEAR, f"{what}: {len(found)} poses at odometry's stamps, {100 * mean:.1f} cm off in the mean")
@@ -399,9 +400,7 @@ def check_initial_poses(observer, ros, car):
         check(answered, f"an initial pose is refused on /rosout: {word}")
     # A busy machine publishes poses late, which degrades them for a moment.
     check(wait(observer.localized), "and the car stays localized")
-    since = time.monotonic()
-    wait(lambda: len(errors(observer, car, "/pf/pose/odom", since)) > 20)
-    check_poses(observer, car, "", since, "refused poses move nothing")
+    check_poses(observer, car, "", time.monotonic(), "refused poses move nothing")
 
 
 def check_parameters(observer, call, namespace=""):
@@ -529,7 +528,8 @@ def clocks(program, folder, track):
         recovers(observer, car, "the clock starts again at 0", back, lambda: step(-car.begin_stamp() - 20)())
         recovers(observer, car, "time stands still for 2 s", ["no scans"], lambda: pause(car, 2.0))
         recovers(observer, car, "time stands still for 5 s", ["no scans"], lambda: pause(car, 5.0))
-        recovers(observer, car, "a simulator at half speed for 3 s", ["runs at 0.5"], half_speed)
+        # On a busy machine the rate is read off late messages: 0.4 to 0.6.
+        recovers(observer, car, "a simulator at half speed for 3 s", ["runs at 0.4", "runs at 0.5"], half_speed)
     finally:
         stop(router, process, car)
 

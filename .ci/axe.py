@@ -67,11 +67,12 @@ def wait_for(what, condition, seconds=90):
 class Checker:
     def __init__(self, browser):
         self.browser = browser
-        self.found = []
+        self.found = 0
         self.checked = 0
 
     def check(self, page, view):
-        """Runs axe at every width."""
+        """Runs axe at every width. What it finds is printed at once."""
+        begun = time.monotonic()
         for width, height, theme in WIDTHS:
             page.set_viewport_size({"width": width, "height": height})
             page.evaluate("(theme) => { document.documentElement.dataset.theme = theme; }", theme)
@@ -84,7 +85,11 @@ class Checker:
             for violation in result["violations"]:
                 if violation["impact"] in SERIOUS:
                     for node in violation["nodes"][:3]:
-                        self.found.append((view, width, theme, violation["id"], node["html"][:160], node["failureSummary"]))
+                        self.found += 1
+                        summary = node["failureSummary"].replace("\n", "\n    ")
+                        print(f"{view}, {width} px, {theme}: {violation['id']}: {node['html'][:160]}\n    {summary}", flush=True)
+
+        print(f"{view}: checked in {time.monotonic() - begun:.0f} s", flush=True)
 
     def open(self, url):
         # Scripts of this check are no part of the page: its Content-Security-Policy would refuse them.
@@ -122,7 +127,7 @@ def main():
         def post(path, body):
             request = urllib.request.Request(
                 f"{url}{path}", json.dumps(body).encode(), {"Content-Type": "application/json", "Origin": url})
-            with urllib.request.urlopen(request, timeout=60) as answer:
+            with urllib.request.urlopen(request, timeout=180) as answer:
                 return answer.read()
 
         wait_for("three cars", lambda: len(serves(url)["cars"]) == 3 and all(c["health"] for c in serves(url)["cars"]))
@@ -158,9 +163,7 @@ def main():
             process.kill()
             process.wait()
         shutil.rmtree(folder, ignore_errors=True)
-    for view, width, theme, rule, html, summary in checker.found:
-        print(f"{view}, {width} px, {theme}: {rule}: {html}\n    " + summary.replace("\n", "\n    "))
-    print(f"axe: {checker.checked} checks, {len(checker.found)} violations that are serious or critical")
+    print(f"axe: {checker.checked} checks, {checker.found} violations that are serious or critical")
     return 1 if checker.found else 0
 
 

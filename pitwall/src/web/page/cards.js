@@ -41,7 +41,7 @@ export const element = (tag, className, text) => {
 export const setText = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 
 /// Milliseconds, with a digit behind the point where there is room, and seconds where they are many.
-const ms = (value) => (value >= 1000 ? lasting(value / 1e3) : fixed(value, value < 100 ? 1 : 0, " ms"));
+const ms = (value) => (value >= 1000 ? lasting(value / 1e3) : fixed(value, value < 10 ? 1 : 0, " ms"));
 
 /// How old the pose is.
 const age = ({ pose }) => (pose && pose.age_s >= 1 ? lasting(pose.age_s) : fixed(pose && pose.age_s * 1e3, 0, " ms"));
@@ -63,7 +63,7 @@ export const FACTS = [
   ["round trip", (c) => ms(c.round_trip_s && c.round_trip_s * 1e3), (c) => c.round_trip_s > 0.1, "to the car and back"],
   ["update p99", (c) => ms(c.load && c.load.update_us.p99 / 1e3), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
   ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
-  ["temperature", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – if the machine does not report it"],
+  ["temp.", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – if the machine does not report it"],
   ["missing", (c) => String(missing(c)), null, "messages whose content was sent and has not arrived"],
   ["coverage", (c) => share(c.coverage), (c) => c.coverage < 0.999, "share of what the car sent that is here, of the streams that must be complete"],
 ];
@@ -225,7 +225,7 @@ class Card {
     if (changed) this.root.className = className;
     if (this.index !== index) { this.index = index; this.chip.style.background = colourOf(index); }
     setText(this.state, `${shape} ${car.state}`);
-    if (read || changed) setText(this.since, car.blind ? `silent for ${lasting(car.quiet_s)}` : lasting(car.state_for_s));
+    if (read || changed) setText(this.since, car.blind ? `${lasting(car.quiet_s)} silent` : lasting(car.state_for_s));
     const causes = car.causes.length > 1 ? `${car.causes[0]}; +${car.causes.length - 1}` : car.causes[0] ?? "";
     if (read || changed) setText(this.causes, causes);
     if ((read || changed) && this.causes.title !== car.causes.join("\n")) this.causes.title = car.causes.join("\n");

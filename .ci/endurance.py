@@ -36,8 +36,8 @@ import urllib.request
 sys.path.insert(0, os.path.dirname(__file__))
 from scale import Page, cpu, free_port, handles, memory, spawn, wait  # noqa: E402
 
-# Each sample is of a moment with faults under way. What is flat differs by no more than this. A car keeps what it sent, up to 24 MB of each
-# stream, and a pit wall what its page shows: these fill up for a while.
+# Each sample is of a moment with faults under way. What is flat differs by no more than this. A car keeps what it sent, up to 24 MB of scans
+# and 10 MB of each other stream, and a pit wall what its page shows: these fill up for a while.
 MOST_GROWTH = 1.10
 MORE_MEMORY = 30.0  # MB
 MORE_HANDLES = 12

@@ -7,8 +7,17 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{Kept, MissingReply, MissingRequest, Resent, Topic};
 
-/// Size of each stream's buffer [bytes]: four minutes of scans of 1081 beams at full rate, and far more of the others.
-const MOST: usize = 24 * 1024 * 1024;
+/// Memory of the buffer of scans [bytes]: four minutes of scans of 1081 beams at full rate.
+const MOST_SCANS: usize = 24 * 1024 * 1024;
+/// Memory of each other stream's buffer [bytes]: twenty minutes of poses at full rate.
+const MOST: usize = 10 * 1024 * 1024;
+/// Memory that a message takes beside its bytes: its place in the queue, and the allocator's.
+const EACH: usize = 40;
+
+/// Memory that a message takes.
+fn size(message: &[u8]) -> usize {
+    message.len() + EACH
+}
 
 /// Messages by stream and number.
 #[derive(Debug, Default)]
@@ -25,7 +34,12 @@ struct StreamBuffer {
 
 impl ReplayBuffer {
     /// Keeps a message. The oldest ones are dropped when the buffer is full.
-    pub fn keep(&mut self, topic: Topic, sequence: u64, bytes: Vec<u8>) {
+    pub fn keep(&mut self, topic: Topic, sequence: u64, mut bytes: Vec<u8>) {
+        bytes.shrink_to_fit();
+        let most = match topic {
+            Topic::RecordedScan => MOST_SCANS,
+            _ => MOST,
+        };
         let stream = self.0.entry(topic).or_default();
         if sequence != stream.first + stream.messages.len() as u64 {
             *stream = StreamBuffer {
@@ -33,10 +47,10 @@ impl ReplayBuffer {
                 ..StreamBuffer::default()
             };
         }
-        stream.bytes += bytes.len();
+        stream.bytes += size(&bytes);
         stream.messages.push_back(bytes);
-        while stream.bytes > MOST && stream.messages.len() > 1 {
-            let dropped = stream.messages.pop_front().map_or(0, |oldest| oldest.len());
+        while stream.bytes > most && stream.messages.len() > 1 {
+            let dropped = stream.messages.pop_front().map_or(0, |oldest| size(&oldest));
             stream.bytes -= dropped;
             stream.first += 1;
         }
@@ -157,9 +171,16 @@ mod tests {
 
     #[test]
     fn the_oldest_are_dropped_when_it_is_full() {
-        let buffer = buffer(1..=30, 1 << 20);
+        let buffer = buffer(1..=30, (1 << 20) - EACH);
         let reply = request(&buffer, RUN, &[[1, 30]], 0);
-        assert_eq!((reply.streams[0].first, reply.streams[0].last), (7, 30));
-        assert_eq!(numbers(&reply), [7]);
+        assert_eq!((reply.streams[0].first, reply.streams[0].last), (21, 30));
+        assert_eq!(numbers(&reply), [21]);
+    }
+
+    #[test]
+    fn small_messages_count_with_the_memory_that_they_take() {
+        let buffer = buffer(1..=200_000, 80);
+        let kept = request(&buffer, RUN, &[], 0).streams[0];
+        assert_eq!(kept.last - kept.first + 1, (MOST / (80 + EACH)) as u64);
     }
 }

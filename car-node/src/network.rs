@@ -46,7 +46,7 @@ pub enum NetworkError {
 /// Where a pit wall on this machine listens.
 const LOCAL_ADDRESS: &str = "127.0.0.1:7447";
 
-/// Longest message from the network \[bytes\], the same as at the pit wall: whoever sends a longer one is disconnected there.
+/// Longest message from the network \[bytes\], the same as at the pit wall, which drops longer ones.
 const LONGEST_MESSAGE: usize = 17 * 1024 * 1024;
 
 /// Send buffer of the operating system [bytes]: enough for 10 Mbit/s at a round trip of 10 ms.

@@ -8,6 +8,7 @@
 //! ```
 
 mod answer_cache;
+mod asker_versions;
 mod command_handler;
 pub mod command_server;
 mod local_commands;

@@ -6,10 +6,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 use crossbeam_channel::{Receiver, Sender};
-use protocol::{MissingRequest, Stamps, Topic, decode, encode};
+use protocol::{EventKind, MissingRequest, Stamps, Topic, decode, encode};
 
+use super::asker_versions::AskerVersions;
 use super::request::{Request, serve};
-use crate::sensors::clock::wall_now;
+use crate::sensors::clock::{SensorClock, wall_now};
 use crate::telemetry::replay_buffer::ReplayBuffer;
 use crate::telemetry::shared_state::SharedState;
 
@@ -22,8 +23,10 @@ pub struct QueryServer {
     pub info: Vec<u8>,
     /// Telemetry that was sent before.
     pub replay_buffer: Arc<Mutex<ReplayBuffer>>,
-    /// Counts queries that cannot be decoded.
+    /// Counts queries that cannot be decoded, and takes events.
     pub shared: Arc<SharedState>,
+    /// The sensors' clock, for events.
+    pub clock: SensorClock,
     /// This run of the node.
     pub run_id: u64,
     /// Has room for one. Holds something when a pit wall has asked for missing telemetry.
@@ -33,7 +36,11 @@ pub struct QueryServer {
 impl QueryServer {
     /// Starts the thread. It ends when `stop` is dropped.
     pub fn start(self, requests: Receiver<Request>, stop: Receiver<()>) -> std::io::Result<JoinHandle<()>> {
+        let versions = Mutex::new(AskerVersions::default());
         serve("query-server", requests, stop, move |topic, payload| {
+            if topic == Topic::Info {
+                self.compare_versions(&versions, payload.unwrap_or_default());
+            }
             self.reply(topic, payload)
         })
     }
@@ -49,6 +56,19 @@ impl QueryServer {
                     tracing::warn!(%topic, count, error, "a query cannot be read");
                 }
             }),
+        }
+    }
+
+    /// Says so when the program that asks has another version than this one.
+    fn compare_versions(&self, versions: &Mutex<AskerVersions>, asker: &[u8]) {
+        let note = versions
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .note(asker, env!("CARGO_PKG_VERSION"));
+        if let Some(text) = note {
+            tracing::warn!("{text}");
+            let kind = EventKind::Warning { text };
+            self.shared.event(self.clock.now(), 0, kind, None, None);
         }
     }
 

@@ -398,6 +398,7 @@ impl Node {
             info: info_message,
             replay_buffer,
             shared: Arc::clone(&shared),
+            clock: clock.clone(),
             run_id,
             asked: on_asked,
         };

@@ -272,10 +272,12 @@ impl Client {
         Some(())
     }
 
-    /// Queries what runs on the car and emits it as an event. None when the car does not reply.
+    /// Queries what runs on the car and emits it as an event. None when the car does not reply. The car learns the version of this
+    /// program, and says so when it is another one.
     pub async fn fetch_info(&self, car: &CarName) -> Option<CarInfo> {
+        let version = env!("CARGO_PKG_VERSION").into();
         let (_, info) = self
-            .query_message::<CarInfo>(car, Topic::Info, Vec::new(), REPLY_TIMEOUT)
+            .query_message::<CarInfo>(car, Topic::Info, version, REPLY_TIMEOUT)
             .await?;
         self.emit(car, EventPayload::Info(info.clone()));
         Some(info)

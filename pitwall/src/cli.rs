@@ -37,6 +37,9 @@ pub(crate) struct Page {
         default_value = "127.0.0.1:7448"
     )]
     pub(crate) address: SocketAddr,
+    /// Also print the page's address as a QR code, for a phone. It holds the token, if there is one.
+    #[arg(long)]
+    pub(crate) qr: bool,
     /// Folder for the recordings that are started from the page.
     #[arg(long, value_name = "FOLDER", default_value = ".")]
     pub(crate) recordings: PathBuf,
@@ -350,6 +353,9 @@ pub(crate) enum KeysVerb {
         /// Also write the keys of NAME into this folder, such as one that a container sees.
         #[arg(long = "copy", value_name = "NAME=FOLDER", value_parser = copy_to)]
         copies: Vec<(CarName, PathBuf)>,
+        /// With --token: also print the page at this address, with the token, as a QR code for the operator's phone.
+        #[arg(long, value_name = "ADDRESS:PORT", requires = "tokens")]
+        qr: Option<String>,
         /// Days until the keys expire, 1 to 3650.
         #[arg(long, value_name = "DAYS", default_value_t = 365, allow_negative_numbers = true, value_parser = clap::value_parser!(u32).range(1..=3650))]
         days: u32,

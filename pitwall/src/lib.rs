@@ -47,6 +47,7 @@ mod network;
 mod number_ranges;
 mod output;
 mod program;
+mod qr_code;
 mod recording;
 mod replay;
 mod report;

@@ -8,8 +8,9 @@ use keys::{Authority, Bundle, Issued, Member, Role};
 use protocol::CarName;
 use serde_json::json;
 
+use super::this_machine;
 use crate::cli::{KeysVerb, Owners};
-use crate::output;
+use crate::{output, qr_code};
 
 /// The authority's own file in the folder of the keys.
 const AUTHORITY: &str = "authority.keys";
@@ -27,9 +28,10 @@ pub(super) fn run(folder: Option<PathBuf>, verb: &KeysVerb, json: bool) -> anyho
             hosts,
             missing,
             copies,
+            qr,
             days,
         } => {
-            let outcome = new(&folder, owners, hosts, *missing, *days, json)?;
+            let outcome = new(&folder, owners, hosts, *missing, *days, qr.as_deref(), json)?;
             deliver(&folder, copies)?;
             Ok(outcome)
         }
@@ -54,6 +56,7 @@ fn new(
     hosts: &[String],
     missing: bool,
     days: u32,
+    qr: Option<&str>,
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     make_folder(folder)?;
@@ -79,7 +82,7 @@ fn new(
         owners.viewer = vec!["viewer".parse()?];
     }
     let hosts = if hosts.is_empty() {
-        this_machine()
+        this_machine::names()
     } else {
         hosts.to_vec()
     };
@@ -114,6 +117,10 @@ fn new(
             "token of {operator} for the page, shown once: {}",
             token.reveal()
         ));
+        if let Some(page) = qr {
+            let address = format!("https://{page}/?token={}", token.reveal());
+            output::print(&format!("{}\n{}", qr_code::draw(&address)?, qr_warning(operator)));
+        }
     }
     if fresh {
         output::print(&format!(
@@ -270,6 +277,14 @@ fn copies(folder: &Path, authority: &Authority, changed: &[(Role, CarName)], pit
         .collect()
 }
 
+/// What a code with a token gives away.
+fn qr_warning(operator: &CarName) -> String {
+    format!(
+        "The code opens the page as {operator}. Whoever photographs it can do that, too: clear the screen when {operator} has \
+         scanned it. The phone trusts the page after it has imported {CERTIFICATE}."
+    )
+}
+
 fn print_copies(copies: &[PathBuf]) {
     if copies.is_empty() {
         return;
@@ -299,26 +314,4 @@ fn make_folder(folder: &Path) -> anyhow::Result<()> {
     builder
         .create(folder)
         .with_context(|| folder.display().to_string())
-}
-
-/// The names and addresses of this machine, under which a browser reaches the page.
-fn this_machine() -> Vec<String> {
-    let mut hosts = vec!["localhost".to_owned(), "127.0.0.1".to_owned()];
-    if let Some(name) = sysinfo::System::host_name().filter(|name| name.is_ascii() && !name.is_empty()) {
-        hosts.push(format!("{name}.local"));
-        hosts.push(name);
-    }
-    // A datagram socket that is "connected" sends nothing, and knows the address it would send from.
-    for target in ["10.255.255.255:9", "192.168.255.255:9", "172.31.255.255:9"] {
-        let address = std::net::UdpSocket::bind("0.0.0.0:0")
-            .and_then(|socket| socket.connect(target).map(|()| socket))
-            .and_then(|socket| socket.local_addr());
-        if let Ok(address) = address {
-            let address = address.ip().to_string();
-            if !hosts.contains(&address) {
-                hosts.push(address);
-            }
-        }
-    }
-    hosts
 }

@@ -22,6 +22,7 @@ mod report;
 mod router;
 mod serve;
 mod sessions;
+mod this_machine;
 mod watch;
 
 use std::process::ExitCode;

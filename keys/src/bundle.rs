@@ -73,6 +73,23 @@ impl Bundle {
         write_private(file, &(text + "\n"))
     }
 
+    /// Why a host with a certificate of this common name is not heard: it was revoked or replaced. None when it is in force.
+    pub fn revoked(&self, common_name: &str) -> Option<String> {
+        if self
+            .members
+            .iter()
+            .any(|member| member.common_name == common_name)
+        {
+            return None;
+        }
+        let Ok(Identity { role, name, .. }) = common_name.parse() else {
+            return Some("a host is connected with a certificate that names no role: it is not heard".into());
+        };
+        Some(format!(
+            "{role} {name} is connected with keys that were revoked or replaced: it is not heard"
+        ))
+    }
+
     /// Refuses the keys of another role, or of another car.
     pub fn for_role(self, role: Role, car: Option<&CarName>) -> Result<Self, KeyError> {
         let fits = self.role == role && car.is_none_or(|car| *car == self.name);

@@ -35,6 +35,7 @@ mod access;
 mod authority;
 mod bundle;
 mod error;
+mod forgeries;
 mod identity;
 mod passphrase;
 mod private_file;

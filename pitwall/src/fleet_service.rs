@@ -402,6 +402,7 @@ async fn run_periodic_tasks(service: std::sync::Weak<FleetService>) {
         };
         if reported.is_none_or(|at| at.elapsed() >= FleetService::REPORT_LINKS) {
             reported = Some(Instant::now());
+            service.connection.note_revoked().await;
             for refusal in keys::refusals::take() {
                 tracing::warn!("{refusal}");
                 service

@@ -2,11 +2,13 @@
 //!
 //! It gives pit walls and cars on private loopback endpoints, and two kinds of car: [`FakeCar`], which only speaks the
 //! protocol, and [`start_real`], a whole node on a simulated track. It also records a race ([`RaceSession`]), writes a bag of a drive through a small room
-//! ([`write_bag`]), has a link that can be cut ([`Link`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
+//! ([`write_bag`]), has a link that can be cut ([`Link`]), lets cars drive beside an attack
+//! ([`three_cars`]), measures the processor time taken by the host ([`steal_time`]), and waits for conditions with a
 //! deadline ([`wait_until`]).
 
 #[cfg(feature = "browser")]
 mod browser;
+mod bystanders;
 mod fake_car;
 mod link;
 mod race_session;
@@ -16,6 +18,9 @@ mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
+pub use bystanders::{
+    alone, attack_factor, is_named, log_has, nothing_is_lost, received, the_streams_stay_complete, three_cars,
+};
 pub use fake_car::{Behaviour, FakeCar};
 pub use link::Link;
 pub use race_session::RaceSession;

@@ -1,20 +1,23 @@
 //! Who gets in, and what they may do: keys, passphrase, and attacks on both.
 
+use std::io::Write;
+use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::time::Duration;
 
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
 use keys::{Authority, Protection, Role, Side, Signer};
 use pitwall::{FleetService, unix_now};
 use protocol::{Action, Answer, CarName, Command, CommandId, Key, Outcome, Stamps, Topic, decode, encode};
 use system_tests::{
-    Behaviour, FakeCar, client, free_endpoint, in_force, named, router, select, send_command,
-    start_real_protected, wait_until,
+    Behaviour, FakeCar, alone, attack_factor as times, client, free_endpoint, in_force, is_named, log_has,
+    named, nothing_is_lost, router, select, send_command, start_real_protected, the_streams_stay_complete,
+    three_cars, wait_until,
 };
-use tracing_subscriber::layer::SubscriberExt;
-use tracing_subscriber::util::SubscriberInitExt;
 use zenoh::Session;
 
-/// A team with a laptop, three cars and a viewer.
+/// A team with a laptop, three cars, one that does harm, and a viewer.
 fn team() -> Authority {
     let mut authority = Authority::create(30).expect("an authority");
     for (role, name) in [
@@ -22,6 +25,7 @@ fn team() -> Authority {
         (Role::Car, "car-1"),
         (Role::Car, "car-2"),
         (Role::Car, "car-3"),
+        (Role::Car, "thief"),
         (Role::Viewer, "fan"),
     ] {
         authority.issue(role, named(name), &[]).expect("issued");
@@ -47,19 +51,30 @@ async fn pit_wall(authority: &Authority, endpoint: &str) -> Arc<FleetService> {
 
 /// A session that follows no rules but those of the other side. None when it is not let in.
 async fn session(endpoint: &str, protection: &Protection) -> Option<Session> {
-    let mut config = zenoh::Config::default();
     let settings = protection.settings(&Side::Client).expect("settings");
+    let rules = settings
+        .entries
+        .iter()
+        .filter(|(key, _)| *key != "access_control");
+    open(endpoint, rules.cloned().collect()).await
+}
+
+/// The same, encrypted for a host of the team, which shows no certificate.
+async fn session_without_certificate(endpoint: &str, authority: &Authority) -> Option<Session> {
+    let team = BASE64_STANDARD.encode(authority.certificate());
+    let tls = serde_json::json!({"root_ca_certificate_base64": team, "verify_name_on_connect": false});
+    open(endpoint, vec![("transport/link/tls", tls.to_string())]).await
+}
+
+async fn open(endpoint: &str, rules: Vec<(&'static str, String)>) -> Option<Session> {
+    let mut config = zenoh::Config::default();
     let plain = [
         ("mode", r#""client""#.to_owned()),
         ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
         ("connect/timeout_ms", "1500".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
     ];
-    let rules = settings
-        .entries
-        .iter()
-        .filter(|(key, _)| *key != "access_control");
-    for (key, value) in plain.iter().chain(rules) {
+    for (key, value) in plain.iter().chain(&rules) {
         config.insert_json5(key, value).expect("a good setting");
     }
     zenoh::open(config).await.ok()
@@ -125,6 +140,7 @@ async fn seen(wall: &FleetService, car: &CarName) {
     reason = "one team and one car, and everybody who tries to command it"
 )]
 async fn keys_decide_who_commands() {
+    let _alone = alone().await;
     let authority = team();
     let endpoint = free_tls_endpoint();
     let wall = pit_wall(&authority, &endpoint).await;
@@ -195,6 +211,12 @@ async fn keys_decide_who_commands() {
         .await,
         None
     );
+    // All three pit walls are in this process.
+    wait_until("the viewer is named", || {
+        let text = "viewer fan commanded car-1 (cmd/params)";
+        [&wall, &second, &viewer].iter().any(|wall| log_has(wall, text))
+    })
+    .await;
 
     // Past the router's rules the car refuses by itself: no signature, a viewer's, that of another command.
     let raw = session(&endpoint, &laptop).await.expect("let in");
@@ -263,6 +285,7 @@ async fn keys_decide_who_commands() {
         .await;
     }
     assert!(faults(replayed).contains("does not belong"));
+    is_named(&wall, "does not belong").await;
     node.shutdown("the test is over");
     for service in [second, viewer, wall] {
         service.close().await;
@@ -271,22 +294,22 @@ async fn keys_decide_who_commands() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn strangers_stay_outside_and_cars_write_under_their_own_name() {
-    tracing_subscriber::registry()
-        .with(keys::refusals::watch())
-        .init();
+    let _alone = alone().await;
     let mut authority = team();
     let endpoint = free_tls_endpoint();
-    let stolen = keys_of(&authority, Role::Car, "car-3");
-    authority.revoke(Role::Car, &named("car-3")).expect("revoked");
+    authority.issue(Role::Car, named("stolen"), &[]).expect("issued");
+    let stolen = keys_of(&authority, Role::Car, "stolen");
+    authority.revoke(Role::Car, &named("stolen")).expect("revoked");
     let wall = pit_wall(&authority, &endpoint).await;
-    let good = keys_of(&authority, Role::Car, "car-1");
-    let car = FakeCar::start_protected("car-1", &endpoint, Behaviour::default(), &good).await;
-    seen(&wall, car.name()).await;
+    let cars = three_cars(&endpoint, &wall, |name| keys_of(&authority, Role::Car, name)).await;
 
-    // No certificate, an expired one, one of another authority.
+    // No encryption, no certificate, an expired one, one of another authority.
     let plain = endpoint.replace("tls/", "tcp/");
     assert!(session(&plain, &Protection::None).await.is_none());
+    is_named(&wall, "it does not speak TLS").await;
     assert!(session(&endpoint, &Protection::None).await.is_none());
+    assert!(session_without_certificate(&endpoint, &authority).await.is_none());
+    is_named(&wall, "it has no certificate").await;
     let mut late = authority.clone();
     late.issue_until(
         Role::Car,
@@ -295,59 +318,86 @@ async fn strangers_stay_outside_and_cars_write_under_their_own_name() {
         time::OffsetDateTime::UNIX_EPOCH,
     )
     .expect("issued");
-    assert!(
-        session(&endpoint, &keys_of(&late, Role::Car, "late"))
-            .await
-            .is_none()
-    );
-    assert!(
-        session(&endpoint, &keys_of(&team(), Role::Car, "car-1"))
-            .await
-            .is_none()
-    );
-
-    // The pit wall says why.
-    for why in ["has expired", "does not know the authority"] {
-        wait_until(why, || {
-            let fleet = wall.fleet();
-            let mut refusals = fleet.log().since(0).filter(|entry| entry.kind == "refused");
-            refusals.any(|entry| entry.text.contains(why))
-        })
-        .await;
-    }
+    let expired = keys_of(&late, Role::Car, "late");
+    assert!(session(&endpoint, &expired).await.is_none());
+    is_named(&wall, "has expired").await;
+    let foreign = keys_of(&team(), Role::Car, "car-1");
+    assert!(session(&endpoint, &foreign).await.is_none());
+    is_named(&wall, "does not know the authority").await;
+    nothing_is_lost(&wall, &cars).await;
 
     // Another car's keys, and revoked ones, connect and are not heard.
-    for (protection, name) in [
-        (keys_of(&authority, Role::Car, "car-2"), "car-3"),
-        (stolen, "car-3"),
+    let thief = keys_of(&authority, Role::Car, "thief");
+    for (protection, name, named) in [
+        (&thief, "ghost", "car thief published in the name of ghost"),
+        (
+            &stolen,
+            "stolen",
+            "car stolen is connected with keys that were revoked",
+        ),
     ] {
-        let forger = FakeCar::start_protected(name, &endpoint, Behaviour::default(), &protection).await;
-        let before = car.published()[&Topic::Pose];
-        wait_until("the good car goes on", || {
-            car.published()[&Topic::Pose] > before + 40
-        })
-        .await;
+        let forger = FakeCar::start_protected(name, &endpoint, Behaviour::default(), protection).await;
+        is_named(&wall, named).await;
+        nothing_is_lost(&wall, &cars).await;
         assert!(wall.fleet().car(forger.name()).is_none(), "{name}");
         forger.leave().await;
     }
-    // With its own name, car-2 is heard, and not under another.
-    let own = keys_of(&authority, Role::Car, "car-2");
-    let raw = session(&endpoint, &own).await.expect("let in");
-    let pose = Key::new(named("car-1"), Topic::Event).to_string();
-    raw.put(&pose, vec![0xff; 60]).await.expect("sent");
-    let second = FakeCar::start_protected("car-2", &endpoint, Behaviour::default(), &own).await;
-    seen(&wall, second.name()).await;
-    let forged = wall
-        .fleet()
-        .log()
-        .since(0)
-        .any(|entry| entry.kind == "unreadable");
-    assert!(!forged);
+    // Neither is a message in the name of a car that drives, or of all cars.
+    let raw = session(&endpoint, &thief).await.expect("let in");
+    for car in ["car-1", "*"] {
+        let key = format!("{}/{car}/{}", Key::PREFIX, Topic::Event);
+        raw.put(&key, vec![0xff; 60]).await.expect("sent");
+    }
+    is_named(&wall, "car thief published in the name of car-1 (event)").await;
+    is_named(&wall, "car thief published in the name of every car (event)").await;
+    // With its own name it is heard. So what it sent before has arrived.
+    let own = FakeCar::start_protected("thief", &endpoint, Behaviour::default(), &thief).await;
+    seen(&wall, own.name()).await;
+    nothing_is_lost(&wall, &cars).await;
+    let fleet = wall.fleet();
+    assert!(!fleet.log().since(0).any(|entry| entry.kind == "unreadable"));
+    // Nobody else is accused.
+    for car in &cars {
+        let accused = format!("car {} ", car.name());
+        let mut refused = fleet.log().since(0).filter(|entry| entry.kind == "refused");
+        let entry = refused.find(|entry| entry.text.starts_with(&accused));
+        assert_eq!(entry.map(|entry| entry.text.clone()), None);
+    }
+    drop(fleet);
+    wall.close().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn half_open_connections_and_noise_shut_no_car_out() {
+    let _alone = alone().await;
+    let authority = team();
+    let endpoint = free_tls_endpoint();
+    let wall = pit_wall(&authority, &endpoint).await;
+    let cars = three_cars(&endpoint, &wall, |name| keys_of(&authority, Role::Car, name)).await;
+    let address: SocketAddr = endpoint.trim_start_matches("tls/").parse().expect("an address");
+    let open: Vec<_> = (0..200 * times())
+        .map(|number| {
+            let mut socket = TcpStream::connect(address).expect("connects");
+            if number % 2 == 0 {
+                socket.write_all(b"GET / HTTP/1.1\r\n\r\n").ok();
+            }
+            socket
+        })
+        .collect();
+    is_named(&wall, "it said nothing, as half-open connections do").await;
+    is_named(&wall, "it does not speak TLS").await;
+    nothing_is_lost(&wall, &cars).await;
+    // A car that comes now is let in.
+    let thief = keys_of(&authority, Role::Car, "thief");
+    let late = FakeCar::start_protected("thief", &endpoint, Behaviour::default(), &thief).await;
+    seen(&wall, late.name()).await;
+    drop(open);
     wall.close().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_passphrase_lets_in_whoever_knows_it() {
+    let _alone = alone().await;
     let with = |words| Protection::Passphrase(Arc::new(keys::Passphrase::new(words).expect("long enough")));
     let (right, wrong) = (
         with("four words for a club day"),
@@ -364,7 +414,9 @@ async fn a_passphrase_lets_in_whoever_knows_it() {
     let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     assert!(session(&endpoint, &wrong).await.is_none());
+    is_named(&wall, "it has another passphrase").await;
     assert!(session(&endpoint, &Protection::None).await.is_none());
+    is_named(&wall, "it has no passphrase").await;
     // Whoever gets past the pit wall still needs the passphrase.
     let inside = session(&endpoint, &right).await.expect("let in");
     let forged = bytes(&command("mallory", select("hq")));
@@ -376,16 +428,19 @@ async fn a_passphrase_lets_in_whoever_knows_it() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_flood_of_commands_is_named_and_others_are_served() {
-    let authority = team();
+    let _alone = alone().await;
+    let mut authority = team();
+    authority.issue(Role::Car, named("target"), &[]).expect("issued");
     let endpoint = free_tls_endpoint();
     let wall = pit_wall(&authority, &endpoint).await;
-    let car = named("car-1");
+    let cars = three_cars(&endpoint, &wall, |name| keys_of(&authority, Role::Car, name)).await;
+    let car = named("target");
     let node = start_real_protected(
         &car,
         0.0,
         &endpoint,
         None,
-        keys_of(&authority, Role::Car, "car-1"),
+        keys_of(&authority, Role::Car, "target"),
     );
     seen(&wall, &car).await;
     let raw = session(&endpoint, &keys_of(&authority, Role::Pit, "laptop"))
@@ -402,17 +457,10 @@ async fn a_flood_of_commands_is_named_and_others_are_served() {
             .await
             .expect("sent");
     }
+    the_streams_stay_complete(&wall, &cars).await;
     let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
-    wait_until("the flood is named", || {
-        let fleet = wall.fleet();
-        fleet.log().since(0).any(|entry| {
-            entry
-                .text
-                .contains("unknown sends more than 20 commands a second")
-        })
-    })
-    .await;
+    is_named(&wall, "unknown sends more than 20 commands a second").await;
     let refused = wall
         .fleet()
         .log()

@@ -9,66 +9,24 @@ use std::time::Duration;
 
 use keys::Protection;
 use pitwall::{Fleet, FleetService, PageOptions, PitWallOptions, PitWallServer, unix_now};
-use protocol::{CarName, Event, EventKind, Key, Stamps, Topic, encode};
-use system_tests::{Behaviour, FakeCar, free_endpoint, named, router, stranger, wait_until};
+use protocol::{Event, EventKind, Key, Stamps, Topic, encode};
+use system_tests::{
+    Behaviour, FakeCar, alone, attack_factor as times, free_endpoint, is_named, log_has, named,
+    nothing_is_lost, received, router, stranger, three_cars, wait_until,
+};
 use zenoh::qos::CongestionControl;
 
 async fn pit_wall(endpoint: &str) -> Arc<FleetService> {
     FleetService::open(&router(endpoint)).await.expect("a pit wall")
 }
 
-/// How many times as large each attack is.
-fn times() -> usize {
-    std::env::var("PITWALL_ATTACK")
-        .ok()
-        .and_then(|factor| factor.parse().ok())
-        .unwrap_or(1)
-}
-
 async fn real_cars(endpoint: &str, wall: &FleetService) -> Vec<FakeCar> {
-    let mut cars = Vec::new();
-    for name in ["car-1", "car-2", "car-3"] {
-        cars.push(FakeCar::start(name, endpoint, Behaviour::default()).await);
-    }
-    for car in &cars {
-        wait_until("the car is seen", || received(wall, car.name()) > 0).await;
-    }
-    cars
-}
-
-/// Poses that have arrived from a car.
-fn received(wall: &FleetService, car: &CarName) -> u64 {
-    stream(wall, car, Topic::Pose).0
-}
-
-/// Messages that arrived, and that are missing.
-fn stream(wall: &FleetService, car: &CarName, topic: Topic) -> (u64, u64) {
-    let fleet = wall.fleet();
-    let view = fleet.car(car).map(|car| car.view(unix_now()));
-    view.and_then(|view| {
-        let stream = view.streams.get(topic.as_str())?;
-        Some((stream.received, stream.missing))
-    })
-    .unwrap_or_default()
-}
-
-/// Waits for forty more poses of each car, and checks that none is missing of what must be complete.
-async fn nothing_is_lost(wall: &FleetService, cars: &[FakeCar]) {
-    for car in cars {
-        let before = received(wall, car.name());
-        wait_until("the car goes on", || received(wall, car.name()) >= before + 40).await;
-        for topic in [Topic::Pose, Topic::Health, Topic::Event] {
-            wait_until("nothing is missing", || stream(wall, car.name(), topic).1 == 0).await;
-        }
-    }
-}
-
-fn log_has(wall: &FleetService, text: &str) -> bool {
-    wall.fleet().log().since(0).any(|entry| entry.text.contains(text))
+    three_cars(endpoint, wall, |_| Protection::None).await
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn announced_cars_are_bounded_and_forgotten() {
+    let _alone = alone().await;
     let endpoint = free_endpoint();
     let wall = pit_wall(&endpoint).await;
     let harm = stranger(&endpoint).await;
@@ -92,6 +50,7 @@ async fn announced_cars_are_bounded_and_forgotten() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_car_that_floods_is_named_and_muted() {
+    let _alone = alone().await;
     let endpoint = free_endpoint();
     let wall = pit_wall(&endpoint).await;
     let cars = real_cars(&endpoint, &wall).await;
@@ -120,7 +79,8 @@ async fn a_car_that_floods_is_named_and_muted() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_huge_message_disconnects_its_sender_alone() {
+async fn a_huge_message_is_dropped_and_named() {
+    let _alone = alone().await;
     let endpoint = free_endpoint();
     let wall = pit_wall(&endpoint).await;
     let cars = real_cars(&endpoint, &wall).await;
@@ -128,6 +88,7 @@ async fn a_huge_message_disconnects_its_sender_alone() {
     let key = Key::new(named("mallory"), Topic::Scan).to_string();
     let put = harm.put(&key, vec![0; (40_000_000 * times()).min(100_000_000)]);
     put.congestion_control(CongestionControl::Block).await.ok();
+    is_named(&wall, "a host sent a longer message than is allowed").await;
     nothing_is_lost(&wall, &cars).await;
     assert!(
         wall.fleet()
@@ -139,6 +100,7 @@ async fn a_huge_message_disconnects_its_sender_alone() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn text_from_the_network_cannot_control_what_shows_it() {
+    let _alone = alone().await;
     let endpoint = free_endpoint();
     let wall = pit_wall(&endpoint).await;
     let harm = stranger(&endpoint).await;
@@ -175,6 +137,53 @@ async fn text_from_the_network_cannot_control_what_shows_it() {
     wall.close().await;
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn random_bytes_on_every_key_and_names_that_are_no_names_are_ignored() {
+    let _alone = alone().await;
+    let endpoint = free_endpoint();
+    let wall = pit_wall(&endpoint).await;
+    let cars = real_cars(&endpoint, &wall).await;
+    let harm = stranger(&endpoint).await;
+    for number in 0..10 * times() as u64 {
+        let bytes: Vec<u8> = (0..997_u64)
+            .map(|at| ((at + number * 997).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56) as u8)
+            .collect();
+        for topic in Topic::all() {
+            let key = Key::new(named("mallory"), topic).to_string();
+            harm.put(&key, bytes.clone()).await.expect("sent");
+        }
+    }
+    for name in [
+        "<img src=x onerror=alert(1)>",
+        "\u{1b}]0;owned\u{7}",
+        "\u{202e}1-rac",
+    ] {
+        let key = format!("{}/{name}/{}", Key::PREFIX, Topic::Pose);
+        harm.put(&key, vec![0; 100]).await.expect("sent");
+    }
+    is_named(&wall, "that is no car's key").await;
+    wait_until("unreadable messages are named", || {
+        let fleet = wall.fleet();
+        let mut log = fleet.log().since(0);
+        log.any(|entry| entry.kind == "unreadable" && entry.car == Some(named("mallory")))
+    })
+    .await;
+    nothing_is_lost(&wall, &cars).await;
+    let fleet = wall.fleet();
+    let shown: String = fleet.log().since(0).map(|entry| entry.text.clone()).collect();
+    assert!(
+        !shown.chars().any(|c| c.is_control() || c == '\u{202e}'),
+        "{shown:?}"
+    );
+    assert!(
+        fleet
+            .cars()
+            .all(|car| car.name.as_str().starts_with("car-") || car.name == named("mallory"))
+    );
+    drop(fleet);
+    wall.close().await;
+}
+
 /// Status line of a request to the page.
 fn get(address: SocketAddr) -> Option<String> {
     let mut stream = TcpStream::connect_timeout(&address, Duration::from_secs(5)).ok()?;
@@ -191,6 +200,7 @@ fn get(address: SocketAddr) -> Option<String> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn half_open_sockets_and_noise_shut_nobody_out() {
+    let _alone = alone().await;
     let endpoint = free_endpoint();
     let server = PitWallServer::start(PitWallOptions {
         role: router(&endpoint),
@@ -229,6 +239,13 @@ async fn half_open_sockets_and_noise_shut_nobody_out() {
         .await
         .expect("no panic");
     assert_eq!(status.as_deref(), Some("HTTP/1.1 200 OK"));
+    is_named(&wall, "it said nothing, as half-open connections do").await;
+    is_named(
+        &wall,
+        "127.0.0.1 was refused: what it sends is no message of a car",
+    )
+    .await;
+    is_named(&wall, "connections to the page said nothing").await;
     nothing_is_lost(&wall, &cars).await;
     // A car that comes now is let in, too.
     let late = FakeCar::start("late", &endpoint, Behaviour::default()).await;

@@ -24,17 +24,19 @@ pub(super) async fn run(network: &NetworkOptions, json: bool) -> anyhow::Result<
             "warning: unprotected: whoever reaches this router can read and command every car",
         );
     }
-    let refusals = tokio::spawn(async {
-        let mut ticks = tokio::time::interval(Duration::from_secs(1));
-        loop {
-            ticks.tick().await;
-            for refusal in keys::refusals::take() {
-                tracing::warn!("{refusal}");
+    let mut ticks = tokio::time::interval(Duration::from_secs(1));
+    let end = interrupted();
+    tokio::pin!(end);
+    loop {
+        tokio::select! {
+            () = &mut end => break,
+            _ = ticks.tick() => {
+                for refusal in router.refusals().await {
+                    tracing::warn!("{refusal}");
+                }
             }
         }
-    });
-    interrupted().await;
-    refusals.abort();
+    }
     router.close().await;
     Ok(ExitCode::SUCCESS)
 }

@@ -31,6 +31,9 @@ use crate::event::{Delivery, EventPayload, EventSink, FleetEvent};
 /// Messages that may wait to be decoded: some ten seconds of twenty cars.
 const QUEUE: usize = 100_000;
 
+/// Characters of a foreign key that are shown.
+const LONGEST_SHOWN_KEY: usize = 60;
+
 /// A connection to the cars.
 pub struct Connection {
     session: zenoh::Session,
@@ -40,6 +43,7 @@ pub struct Connection {
     recorded: Mutex<Vec<Subscriber<()>>>,
     missing_queries: JoinHandle<()>,
     floods: Arc<Mutex<FloodLimit>>,
+    protection: Protection,
 }
 
 impl Drop for Connection {
@@ -106,6 +110,7 @@ impl Connection {
             recorded: Mutex::default(),
             missing_queries,
             floods,
+            protection: protection.clone(),
         })
     }
 
@@ -150,6 +155,11 @@ impl Connection {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .reports()
+    }
+
+    /// Notes hosts that are connected with revoked keys, for [`keys::refusals::take`].
+    pub(crate) async fn note_revoked(&self) {
+        note_revoked(&self.session, &self.protection).await;
     }
 
     /// Queries every car for the ends of its streams ([`EventPayload::StreamEnds`]) and for all that it has sent by then.
@@ -201,6 +211,32 @@ impl Connection {
     }
 }
 
+/// Notes a key under which no car can send, such as one with markup in its name.
+fn note_foreign_key(key: &str) {
+    let shown: String = protocol::plain_text(key)
+        .chars()
+        .take(LONGEST_SHOWN_KEY)
+        .collect();
+    keys::refusals::add(
+        "foreign key",
+        format!("what a stranger sent under {shown:?} was ignored: that is no car's key"),
+    );
+}
+
+/// Notes the owners of connected certificates that are not in force. zenoh lets them connect, and drops what they send.
+async fn note_revoked(session: &zenoh::Session, protection: &Protection) {
+    let Protection::Keys(bundle) = protection else {
+        return;
+    };
+    for link in session.info().links().await {
+        if let Some(name) = link.auth_identifier()
+            && let Some(text) = bundle.revoked(name)
+        {
+            keys::refusals::add(name, text);
+        }
+    }
+}
+
 /// Receives the markers of all pit walls.
 async fn watch_markers(
     session: &zenoh::Session,
@@ -245,17 +281,23 @@ async fn watch_runs(
 }
 
 /// A router that only passes messages on.
-pub struct Router(zenoh::Session);
+pub struct Router(zenoh::Session, Protection);
 
 /// Opens a router. Needs a multi-thread tokio runtime.
 pub async fn open_router(role: &Role, protection: &Protection) -> Result<Router, ConnectionError> {
     let (config, settings) = role.config(protection)?;
     let session = zenoh::open(config).await.map_err(|e| role.open_error(&e))?;
     drop(settings);
-    Ok(Router(session))
+    Ok(Router(session, protection.clone()))
 }
 
 impl Router {
+    /// What was refused since the last call, as sentences.
+    pub async fn refusals(&self) -> Vec<String> {
+        note_revoked(&self.0, &self.1).await;
+        keys::refusals::take()
+    }
+
     /// Ends it. Gives up after two seconds.
     pub async fn close(self) {
         let closing = async { self.0.close().await };
@@ -282,6 +324,7 @@ async fn watch_liveliness(
         .history(true)
         .callback(move |sample| {
             let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+                note_foreign_key(sample.key_expr().as_str());
                 return;
             };
             let payload = match sample.kind() {
@@ -319,7 +362,7 @@ async fn subscribe(
             let at = unix_now();
             // A foreign key names no car to count it for.
             let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
-                tracing::debug!(key = %sample.key_expr(), "ignored a sample under a foreign key");
+                note_foreign_key(sample.key_expr().as_str());
                 return;
             };
             let bytes = sample.payload().len();

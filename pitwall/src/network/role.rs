@@ -18,6 +18,8 @@ pub const LOCAL_PITWALL: &str = "tcp/127.0.0.1:7447";
 
 /// Longest message from the network \[bytes\]: a map of the largest size.
 const LONGEST_MESSAGE: usize = 17 * 1024 * 1024;
+/// Longest time from a connection to its first words, and to the end of its login \[ms\].
+const HANDSHAKE_MS: u32 = 3000;
 /// Most connections at once.
 const MOST_SESSIONS: usize = 300;
 
@@ -107,14 +109,18 @@ impl Role {
             ("transport/link/rx/max_message_size", LONGEST_MESSAGE.to_string()),
             ("transport/unicast/max_sessions", MOST_SESSIONS.to_string()),
             // Sockets that connect and say nothing keep others out for a moment only.
-            ("transport/unicast/accept_timeout", "3000".to_owned()),
+            ("transport/unicast/accept_timeout", HANDSHAKE_MS.to_string()),
             ("transport/unicast/accept_pending", MOST_SESSIONS.to_string()),
         ];
         entries.extend(sockets::zenoh_settings());
         match self {
             Self::Router { listen, .. } => {
                 entries.push(("mode", r#""router""#.to_owned()));
-                entries.push(("listen/endpoints", list(listen)));
+                let listen: Vec<_> = listen
+                    .iter()
+                    .map(|endpoint| patient_for_a_moment(endpoint))
+                    .collect();
+                entries.push(("listen/endpoints", list(&listen)));
             }
             Self::Client { connect } => {
                 entries.push(("mode", r#""client""#.to_owned()));
@@ -179,6 +185,15 @@ pub(crate) fn endpoint(text: &str) -> Result<String, String> {
     text.parse::<EndPoint>()
         .map(|endpoint| endpoint.to_string())
         .map_err(|_| "expected PROTOCOL/ADDRESS:PORT, such as tcp/192.168.1.10:7447".to_owned())
+}
+
+/// The endpoint with a limit on the time of a TLS handshake: sockets that connect and say nothing must not stay.
+fn patient_for_a_moment(endpoint: &str) -> String {
+    if !endpoint.starts_with("tls/") {
+        return endpoint.to_owned();
+    }
+    let separator = if endpoint.contains('#') { ';' } else { '#' };
+    format!("{endpoint}{separator}tls_handshake_timeout_ms={HANDSHAKE_MS}")
 }
 
 /// True when only this machine reaches an endpoint.

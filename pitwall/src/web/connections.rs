@@ -5,6 +5,7 @@
 //! therefore shuts nobody out, and neither does a lack of file handles.
 
 use std::collections::VecDeque;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -73,9 +74,9 @@ pub(super) async fn serve(
     let mut open = OpenConnections::default();
     let mut failures = 0_u64;
     loop {
-        let stream = tokio::select! {
+        let (stream, from) = tokio::select! {
             accepted = listener.accept() => match accepted {
-                Ok((stream, _)) => stream,
+                Ok((stream, from)) => (stream, from.ip()),
                 Err(error) => {
                     failures += 1;
                     if failures.is_power_of_two() {
@@ -100,7 +101,7 @@ pub(super) async fn serve(
             admitted.clone(),
             stopping.clone(),
         );
-        open.add(tasks.spawn(connection), admitted);
+        open.add(tasks.spawn(connection), admitted, from);
     }
     let ended = async { while tasks.join_next().await.is_some() {} };
     if tokio::time::timeout(CLOSING, ended).await.is_err() {
@@ -115,13 +116,13 @@ async fn stopped(stopping: &mut watch::Receiver<bool>) {
 
 /// The connections, the oldest first.
 #[derive(Default)]
-struct OpenConnections(VecDeque<(AbortHandle, Admitted)>);
+struct OpenConnections(VecDeque<(AbortHandle, Admitted, IpAddr)>);
 
 impl OpenConnections {
     /// Closes what must make room for another connection. False when all are in use.
     fn make_room(&mut self) -> bool {
-        self.0.retain(|(task, _)| !task.is_finished());
-        let strangers = self.0.iter().filter(|(_, admitted)| !admitted.get()).count();
+        self.0.retain(|(task, ..)| !task.is_finished());
+        let strangers = self.0.iter().filter(|(_, admitted, _)| !admitted.get()).count();
         if strangers >= MOST_STRANGERS || self.0.len() >= MOST {
             return self.close_oldest_stranger();
         }
@@ -129,16 +130,22 @@ impl OpenConnections {
     }
 
     fn close_oldest_stranger(&mut self) -> bool {
-        let oldest = self.0.iter().position(|(_, admitted)| !admitted.get());
-        let Some((task, _)) = oldest.and_then(|oldest| self.0.remove(oldest)) else {
+        let oldest = self.0.iter().position(|(_, admitted, _)| !admitted.get());
+        let Some((task, _, from)) = oldest.and_then(|oldest| self.0.remove(oldest)) else {
             return false;
         };
         task.abort();
+        keys::refusals::add(
+            "page",
+            format!(
+                "more than {MOST_STRANGERS} connections to the page said nothing: the oldest, from {from}, were closed"
+            ),
+        );
         true
     }
 
-    fn add(&mut self, task: AbortHandle, admitted: Admitted) {
-        self.0.push_back((task, admitted));
+    fn add(&mut self, task: AbortHandle, admitted: Admitted, from: IpAddr) {
+        self.0.push_back((task, admitted, from));
     }
 }
 

@@ -1,0 +1,94 @@
+//! Cars that drive beside an attack and must lose nothing.
+
+use keys::Protection;
+use pitwall::{FleetService, unix_now};
+use protocol::{CarName, Topic};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+
+use crate::{Behaviour, FakeCar, wait_until};
+
+/// Three cars at full rate, seen by the pit wall. `protection` gives each its keys.
+pub async fn three_cars(
+    endpoint: &str,
+    wall: &FleetService,
+    protection: impl Fn(&str) -> Protection,
+) -> Vec<FakeCar> {
+    let mut cars = Vec::new();
+    for name in ["car-1", "car-2", "car-3"] {
+        let keys = protection(name);
+        cars.push(FakeCar::start_protected(name, endpoint, Behaviour::default(), &keys).await);
+    }
+    for car in &cars {
+        wait_until("the car is seen", || received(wall, car.name()) > 0).await;
+    }
+    cars
+}
+
+/// How many times as large each attack is: `PITWALL_ATTACK`, usually 1.
+pub fn attack_factor() -> usize {
+    let factor = std::env::var("PITWALL_ATTACK").ok();
+    factor.and_then(|factor| factor.parse().ok()).unwrap_or(1)
+}
+
+/// Poses that have arrived from a car.
+pub fn received(wall: &FleetService, car: &CarName) -> u64 {
+    stream(wall, car, Topic::Pose).0
+}
+
+/// Messages that arrived, and that are missing.
+fn stream(wall: &FleetService, car: &CarName, topic: Topic) -> (u64, u64) {
+    let fleet = wall.fleet();
+    let view = fleet.car(car).map(|car| car.view(unix_now()));
+    view.and_then(|view| {
+        let stream = view.streams.get(topic.as_str())?;
+        Some((stream.received, stream.missing))
+    })
+    .unwrap_or_default()
+}
+
+/// Waits for forty more poses of each car, and checks that nothing is missing since its start.
+pub async fn nothing_is_lost(wall: &FleetService, cars: &[FakeCar]) {
+    all_arrives(wall, cars, &[Topic::Pose, Topic::Health, Topic::Event]).await;
+}
+
+/// The same where whoever does harm takes so much of this process, which the cars share, that they cannot send each pose: what must be
+/// complete is.
+pub async fn the_streams_stay_complete(wall: &FleetService, cars: &[FakeCar]) {
+    all_arrives(wall, cars, &[Topic::Health, Topic::Event]).await;
+}
+
+async fn all_arrives(wall: &FleetService, cars: &[FakeCar], topics: &[Topic]) {
+    for car in cars {
+        let before = received(wall, car.name());
+        wait_until("the car goes on", || received(wall, car.name()) >= before + 40).await;
+        for topic in topics {
+            wait_until("nothing is missing", || stream(wall, car.name(), *topic).1 == 0).await;
+        }
+    }
+}
+
+/// True when an entry of the pit wall's log contains the text.
+pub fn log_has(wall: &FleetService, text: &str) -> bool {
+    wall.fleet().log().since(0).any(|entry| entry.text.contains(text))
+}
+
+/// Waits until the pit wall's log names an attack.
+pub async fn is_named(wall: &FleetService, text: &str) {
+    wait_until(text, || log_has(wall, text)).await;
+}
+
+/// Held by a test that waits for refusals: zenoh's log, where they are read, belongs to the whole process, and whichever pit wall
+/// comes first takes them.
+pub async fn alone() -> tokio::sync::MutexGuard<'static, ()> {
+    static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
+    static WATCH: std::sync::Once = std::sync::Once::new();
+    let alone = ALONE.lock().await;
+    WATCH.call_once(|| {
+        tracing_subscriber::registry()
+            .with(keys::refusals::watch())
+            .init();
+    });
+    keys::refusals::forget();
+    alone
+}

@@ -88,7 +88,7 @@ class Session:
     def command(self, *words, codes=(0,), patience=600):
         process = self.start(self.wall_side, *words)
         said, _ = process.communicate(timeout=patience)
-        check(process.returncode in codes, f"{' '.join(map(str, words[1:]))}: exit code {process.returncode}: {said[-400:]}")
+        check(process.returncode in codes, f"{' '.join(map(str, words[1:]))}: exit code {process.returncode}: {said[-2000:]}")
         return process.returncode, said
 
 
@@ -164,9 +164,15 @@ def drive(session, seconds, reboot):
 
     _, said = session.command(session.pitwall, "--json", "check", laptop, codes=(0, 7))
     before = json.loads(said)
-    session.command(*session.at_the_wall("record", "--on-car", NAME, "--stop"))
+    # A disk that is slow to close the file is given more time: the car then says that it did not answer, and goes on closing.
+    for _ in range(6):
+        code, said = session.command(*session.at_the_wall("record", "--on-car", NAME, "--stop"), codes=(0, 3))
+        if code == 0:
+            break
+        time.sleep(2)
+    check(code == 0, f"the car does not stop its recording: {said[-400:]}")
     began = time.monotonic()
-    session.command(*session.at_the_wall("fetch", NAME, "--to", fetched, "--rate", "4M"), patience=1200)
+    session.command(*session.at_the_wall("fetch", NAME, "--to", fetched, "--rate", "4M"), patience=2400)
     took = time.monotonic() - began
     ages = [car["pose"]["age_s"] for when, view in views.seen if when > began for car in view if car["car"] == NAME and car["pose"]]
     ages.sort()

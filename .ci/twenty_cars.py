@@ -23,8 +23,8 @@ from pathlib import Path
 MOST_CORES = 0.5
 # The kernel and the allocator take a while to settle [MB].
 MOST_GROWTH = 30
-# Messages a second of one car: five full-rate streams, poses, three views and a little more.
-RATE = 5 * 40 + 40 + 40 + 3 * 10 + 2.5
+# Messages a second of one car: five full-rate streams, poses, health and two views, and a little more.
+RATE = 5 * 40 + 40 + 3 * 10 + 2.5
 
 
 def cpu_seconds(pid):

@@ -3,7 +3,8 @@
     python3 .ci/scale.py PATH/TO/pitwall PATH/TO/test-car [--cars 10,25,50] [--for 20] [--halls 200] [--write docs/scale.md] [--json]
 
 Fake cars send everything at full rate, as a real car does, with 40 scans a second for the recorder. Cost is
-processor time, so that a busy machine changes it little. First the pit wall alone, then with one open page, which asks for snapshots as
+processor time, so that a busy machine changes it little. Where the machine has no time for so many cars, they send less; cost is then
+that of what came, times what would come at full rate. First the pit wall alone, then with one open page, which asks for snapshots as
 fast as it gets them; then a recorder alone. Then light cars in two halls behind zenoh's routers with the configurations of
 compose/scale/, and a pit wall at the centre. That part needs the Python package eclipse-zenoh, and is skipped without it.
 """
@@ -23,6 +24,7 @@ import sys
 import tempfile
 import threading
 import time
+import urllib.request
 
 from links import write
 
@@ -30,6 +32,9 @@ TICKS = os.sysconf("SC_CLK_TCK")
 SCALE = pathlib.Path(__file__).parent.parent / "compose" / "scale"
 # Less than a core for the whole of the largest fleet, and no message lost.
 MOST_CORES = 1.0
+# Messages a second of one car: poses, health and two views, and a little more; and with the five streams of a recorder.
+LIVE = 40 + 3 * 10 + 2.5
+RECORDED = LIVE + 5 * 40
 
 
 def free_port():
@@ -150,6 +155,12 @@ def cost(process, seconds):
     return (cpu(process.pid) - busy) / (time.monotonic() - began)
 
 
+def received(page_port):
+    """Messages that the pit wall has got."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{page_port}/snapshot", timeout=20) as reply:
+        return sum(stream["received"] for car in json.load(reply)["cars"] for stream in car["streams"].values())
+
+
 def missing(snapshot):
     return sum(stream["missing"] for car in snapshot["cars"] for stream in car["streams"].values())
 
@@ -168,13 +179,21 @@ def fleet(arguments, count):
         wait(f"{count} cars", lambda: len(page.lively) >= count)
         page.close()
         time.sleep(3)
+        full = count * LIVE
+        came, since = received(page_port), time.monotonic()
         row["wall_cores"] = cost(wall, arguments.seconds)
+        row["share"] = (received(page_port) - came) / (time.monotonic() - since) / full
+        row["wall_cores"] /= row["share"]
         row["memory_mb"] = memory(wall.pid)
         page = Page(page_port)
         time.sleep(1)
         before, at = page.count, time.monotonic()
         lost = missing(page.last)
-        row["page_cores"] = cost(wall, arguments.seconds) - row["wall_cores"]
+        came, since = received(page_port), time.monotonic()
+        with_page = cost(wall, arguments.seconds)
+        # Without the page it would cost what came now.
+        share = (received(page_port) - came) / (time.monotonic() - since) / full
+        row["page_cores"] = with_page - row["wall_cores"] * share
         row["snapshots_per_s"] = (page.count - before) / (time.monotonic() - at)
         row["snapshot_kb"] = page.bytes / page.count / 1e3
         row["missing"] = max(0, missing(page.last) - lost)
@@ -189,13 +208,17 @@ def fleet(arguments, count):
         time.sleep(1)
         start_cars(stack, arguments.test_car, "rings", count, f"tcp/127.0.0.1:{port}", "full", seconds=4 * arguments.seconds)
         time.sleep(8)
-        written = os.path.getsize(f"{folder}/r.mcap")
+        written, began = os.path.getsize(f"{folder}/r.mcap"), time.monotonic()
         row["recorder_cores"] = cost(recorder, arguments.seconds)
-        row["recorder_kb_per_s"] = (os.path.getsize(f"{folder}/r.mcap") - written) / 1e3 / arguments.seconds
+        row["recorder_kb_per_s"] = (os.path.getsize(f"{folder}/r.mcap") - written) / 1e3 / (time.monotonic() - began)
         row["recorder_memory_mb"] = memory(recorder.pid)
         recorder.send_signal(signal.SIGINT)
         said, _ = recorder.communicate(timeout=90)
-        streams = json.loads(said)["streams"]
+        summary = json.loads(said)
+        streams = summary["streams"]
+        share = sum(stream["received"] for stream in streams) / summary["duration_s"] / (count * RECORDED)
+        row["recorder_cores"] /= share
+        row["recorder_kb_per_s"] /= share
         row["recorded"] = sum(stream["received"] for stream in streams)
         row["recorded_missing"] = sum(stream["missing"] for stream in streams)
     return row
@@ -268,12 +291,12 @@ def slope(rows, name):
     return mean_y - each * mean_x, each
 
 
-HEAD = ["| cars | pit wall [cores] | and a page | snapshots/s | recorder [cores] | memory [MB] | growth [MB] | missing | recorded | recorded, missing |",
-        "|---|---|---|---|---|---|---|---|---|---|"]
+HEAD = ["| cars | sent | pit wall [cores] | and a page | snapshots/s | recorder [cores] | memory [MB] | growth [MB] | missing | recorded | recorded, missing |",
+        "|---|---|---|---|---|---|---|---|---|---|---|"]
 
 
 def line(row):
-    return (f"| {row['cars']} | {row['wall_cores']:.2f} | +{row['page_cores']:.2f} | {row['snapshots_per_s']:.1f} | {row['recorder_cores']:.2f} "
+    return (f"| {row['cars']} | {100 * row['share']:.0f} % | {row['wall_cores']:.2f} | +{row['page_cores']:.2f} | {row['snapshots_per_s']:.1f} | {row['recorder_cores']:.2f} "
             f"| {row['memory_mb']:.0f} | {row['growth_mb']:+.1f} | {row['missing']} | {row['recorded']} | {row['recorded_missing']} |")
 
 

@@ -16,9 +16,9 @@ const COLOURS: [&str; 8] = [
     "#0072b2", "#d55e00", "#009e73", "#000000", "#cc79a7", "#56b4e9", "#e69f00", "#666666",
 ];
 
-const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;max-width:68em;margin:2em auto;padding:0 1em;color:#222}\
+const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;max-width:76em;margin:2em auto;padding:0 1em;color:#222}\
 h1{font-size:1.5em}h2{font-size:1.15em;margin-top:2em}table{border-collapse:collapse}\
-th,td{padding:.2em .8em;text-align:right;border-bottom:1px solid #ddd}th:first-child,td:first-child{text-align:left}\
+th,td{padding:.2em .8em;text-align:right;border-bottom:1px solid #ddd}td{white-space:nowrap}th:first-child,td:first-child{text-align:left}\
 tr.paper td{color:#666;font-style:italic}.no{color:#b00020;font-weight:600}.legend span{margin-right:1.4em;white-space:nowrap}\
 svg{max-width:100%;height:auto}";
 
@@ -188,33 +188,42 @@ struct Chart {
 }
 
 /// Room for the labels of the axes.
-const LEFT: f64 = 60.0;
+const LEFT: f64 = 130.0;
 const BELOW: f64 = 40.0;
 
 impl Chart {
-    fn new(size: [f64; 2], x: [f64; 2], y: [f64; 2], titles: [&str; 2]) -> Self {
+    /// A chart whose rows have names at heights, in place of values, if there are any.
+    fn new(
+        size: [f64; 2],
+        x: [f64; 2],
+        y: [f64; 2],
+        titles: [&str; 2],
+        row_names: &[(String, f64, &str)],
+    ) -> Self {
         let mut chart = Self {
             body: String::new(),
             x,
             y,
             size,
         };
-        for k in 0..=4 {
-            let share = f64::from(k) / 4.0;
-            let value = |range: [f64; 2]| range[0] + share * (range[1] - range[0]);
-            let (at_x, at_y) = (chart.at_x(value(x)), chart.at_y(value(y)));
-            let (x0, x1, below) = (chart.at_x(x[0]), chart.at_x(x[1]), chart.at_y(y[0]));
+        let (x0, x1, below) = (chart.at_x(x[0]), chart.at_x(x[1]), chart.at_y(y[0]));
+        for value in ticks(y) {
+            let at = chart.at_y(value);
             chart.add(format_args!(
-                "<line x1=\"{x0:.1}\" x2=\"{x1:.1}\" y1=\"{at_y:.1}\" y2=\"{at_y:.1}\" stroke=\"#e5e5e5\"/>"
+                "<line x1=\"{x0:.1}\" x2=\"{x1:.1}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#e5e5e5\"/>"
             ));
-            let (label_x, label_y) = (x0 - 6.0, at_y + 4.0);
-            let text = label(value(y), y[1] - y[0]);
+            if row_names.is_empty() {
+                chart.label_y(at, &label(value, y[1] - y[0]), "#222");
+            }
+        }
+        for (name, at, colour) in row_names {
+            let at = chart.at_y(*at);
+            chart.label_y(at, name, colour);
+        }
+        for value in ticks(x) {
+            let (at, text, low) = (chart.at_x(value), label(value, x[1] - x[0]), below + 16.0);
             chart.add(format_args!(
-                "<text x=\"{label_x:.1}\" y=\"{label_y:.1}\" text-anchor=\"end\">{text}</text>"
-            ));
-            let (text, label_y) = (label(value(x), x[1] - x[0]), below + 16.0);
-            chart.add(format_args!(
-                "<text x=\"{at_x:.1}\" y=\"{label_y:.1}\" text-anchor=\"middle\">{text}</text>"
+                "<text x=\"{at:.1}\" y=\"{low:.1}\" text-anchor=\"middle\">{text}</text>"
             ));
         }
         let (middle, below) = (0.5 * (chart.at_x(x[0]) + chart.at_x(x[1])), size[1] - 6.0);
@@ -223,6 +232,14 @@ impl Chart {
             "<text x=\"{middle:.1}\" y=\"{below:.1}\" text-anchor=\"middle\">{title_x}</text><text x=\"4\" y=\"12\">{title_y}</text>"
         ));
         chart
+    }
+
+    /// A label left of the axis.
+    fn label_y(&mut self, at: f64, text: &str, colour: &str) {
+        let (x, y) = (LEFT - 6.0, at + 4.0);
+        self.add(format_args!(
+            "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"end\" fill=\"{colour}\">{text}</text>"
+        ));
     }
 
     fn at_x(&self, x: f64) -> f64 {
@@ -266,6 +283,19 @@ impl Chart {
     }
 }
 
+/// Round values on an axis, about five.
+fn ticks([low, high]: [f64; 2]) -> Vec<f64> {
+    let rough = (high - low) / 5.0;
+    let decade = 10f64.powf(rough.log10().floor());
+    let steps = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * decade);
+    let step = steps.into_iter().find(|step| *step >= rough).unwrap_or(rough);
+    let (first, last) = (
+        (low / step - 1e-9).ceil() as i64,
+        (high / step + 1e-9).floor() as i64,
+    );
+    (first..=last).map(|k| k as f64 * step).collect()
+}
+
 /// A number with as many digits as its axis needs.
 fn label(value: f64, span: f64) -> String {
     let digits = if span < 2.0 { 2 } else { usize::from(span < 20.0) };
@@ -288,7 +318,7 @@ fn along_track(reports: &[Report], quality: Quality) -> String {
         .fold(1.0, f64::max)
         .min(100.0);
     let titles = ["along the raceline, m", "cm"];
-    let mut chart = Chart::new([900.0, 260.0], [0.0, length], [0.0, most], titles);
+    let mut chart = Chart::new([980.0, 260.0], [0.0, length], [0.0, most], titles, &[]);
     for (i, report) in of(reports, quality) {
         let points = report.summary.along_track.iter();
         chart.line(
@@ -302,17 +332,29 @@ fn along_track(reports: &[Report], quality: Quality) -> String {
 /// What a strip of dots shows of a lap.
 type OfLap = fn(&LapRecord) -> f64;
 
-/// Every lap as a dot: lap time, and distance of the car from the raceline.
+/// Every lap as a dot: lap time, and distance of the car from the raceline. Odometry alone would leave the others no room: its dots
+/// that lie beyond theirs stand at the end.
 fn distributions(reports: &[Report], quality: Quality) -> String {
-    let all = || of(reports, quality).flat_map(|(_, report)| &report.summary.every_lap);
     let strips: [(&str, OfLap); 2] = [
-        ("lap time, s", |lap| lap.time_s),
-        ("car to line, cm", |lap| 100.0 * lap.true_line_error_m),
+        (
+            "lap time, s; odometry's slower laps stand at the right end",
+            |lap| lap.time_s,
+        ),
+        (
+            "car to line, cm; odometry's wider laps stand at the right end",
+            |lap| 100.0 * lap.true_line_error_m,
+        ),
     ];
     let rows = of(reports, quality).count() as f64;
+    let names: Vec<(String, f64, &str)> = of(reports, quality)
+        .enumerate()
+        .map(|(row, (i, report))| (escaped(&report.localizer), rows - 0.5 - row as f64, colour(i)))
+        .collect();
     let mut charts = String::new();
     for (title, value) in strips {
-        let (least, most) = all()
+        let (least, most) = of(reports, quality)
+            .filter(|(_, report)| report.localizer != "odometry")
+            .flat_map(|(_, report)| &report.summary.every_lap)
             .map(value)
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), v| {
                 (least.min(v), most.max(v))
@@ -320,12 +362,20 @@ fn distributions(reports: &[Report], quality: Quality) -> String {
         if !(least.is_finite() && most > least) {
             continue;
         }
-        let mut chart = Chart::new([900.0, 230.0], [least, most], [0.0, rows], [title, ""]);
+        let room = 0.04 * (most - least);
+        let span = [least - room, most + room];
+        let mut chart = Chart::new(
+            [980.0, 40.0 + 28.0 * rows],
+            span,
+            [0.0, rows],
+            [title, ""],
+            &names,
+        );
         for (row, (i, report)) in of(reports, quality).enumerate() {
             let laps = &report.summary.every_lap;
             for (k, lap) in laps.iter().enumerate() {
                 let height = rows - 0.2 - row as f64 - 0.6 * (k as f64 + 0.5) / laps.len() as f64;
-                chart.dot([value(lap), height], colour(i));
+                chart.dot([value(lap).clamp(span[0], span[1]), height], colour(i));
             }
         }
         charts += &chart.svg();
@@ -343,5 +393,11 @@ mod tests {
         assert_eq!(label(1.234, 1.0), "1.23");
         assert_eq!(label(12.34, 10.0), "12.3");
         assert_eq!(label(123.4, 100.0), "123");
+        let shown = |range: [f64; 2]| -> Vec<String> {
+            let span = range[1] - range[0];
+            ticks(range).into_iter().map(|value| label(value, span)).collect()
+        };
+        assert_eq!(shown([0.0, 44.0]), ["0", "10", "20", "30", "40"]);
+        assert_eq!(shown([9.161, 9.199]), ["9.17", "9.18", "9.19"]);
     }
 }

@@ -76,6 +76,9 @@ pub struct Monitor {
     before_stale: State,
 }
 
+/// A pose at which so much more of a scan lies on walls than before is another one, in [0, 1].
+const FOUND: f64 = 0.5;
+
 impl Monitor {
     /// A monitor of a localizer that has no pose yet. `now` is on the sensors' clock.
     pub fn new(thresholds: Thresholds, now: Stamp) -> Self {
@@ -208,6 +211,13 @@ impl Monitor {
         if let Some(distance) = pose_jump {
             self.pose_jump = Some((now, distance));
             // The fit before the jump is that of another pose.
+            self.fit = None;
+        }
+        if self
+            .fit
+            .is_some_and(|[_, fast]| update.alignment > fast.alignment + FOUND)
+        {
+            // So is that of a pose that the localizer has given up for one that fits.
             self.fit = None;
         }
         // STALE ends first, so that this scan already counts for the state after it.
@@ -802,6 +812,22 @@ mod tests {
             }
             let took = drive.now.since(begun);
             assert!((0.3..=0.5).contains(&took), "lost after {took} s at {hertz} Hz");
+        }
+    }
+
+    /// The localizer replaces a pose that it has given up, by none of its corrections.
+    #[test]
+    fn a_pose_that_was_replaced_is_not_lost_for_the_scans_before() {
+        for scans in 1.. {
+            let mut drive = Drive::localized();
+            drive.drive(f64::from(scans) * SCAN, wrong_pose);
+            if drive.monitor.verdict().state == State::Lost {
+                assert!(scans > 8, "lost after {scans} scans");
+                break;
+            }
+            let states = drive.drive(1.0, |_| ());
+            assert!(!states.contains(&State::Lost), "{scans} scans: {states:?}");
+            assert_eq!(states.last(), Some(&State::Localized), "{scans} scans");
         }
     }
 

@@ -45,6 +45,9 @@ const ON_WALL: f32 = 0.1;
 /// With a smaller share of the end points on walls nothing is known of where they stand.
 const LEAST_SHARE: f64 = 0.7;
 
+/// More is not how a map is drawn \[m\]: a cell and a half of 5 cm. A wrong pose shows more.
+const MOST_OFFSET: f64 = 0.075;
+
 /// That walls stand as drawn counts as much as this way of seeing them \[m\].
 const DRAWN: f64 = 0.5;
 
@@ -160,9 +163,10 @@ impl WallCalibration {
         // Where nothing is known of a direction, it stays.
         information += Matrix4::from_diagonal_element(UNKNOWN);
         let step = information.cholesky()?.solve(&gradient);
-        let sound = on_walls as f64 >= LEAST_SHARE * looked_at as f64;
+        let offset = known.offset - f64::from(step[3]);
+        let sound = on_walls as f64 >= LEAST_SHARE * looked_at as f64 && offset.abs() <= MOST_OFFSET;
         Some(Self {
-            offset: known.offset - if sound { f64::from(step[3]) } else { 0.0 },
+            offset: if sound { offset } else { known.offset },
             way: known.way,
             scatter: f64::from(*median * SIGMA_OF_MEDIAN),
             // Of the points between those looked at, each has the same in common with its stretch.
@@ -177,15 +181,14 @@ impl WallCalibration {
 
     /// Takes in what one scan showed, after so much driving [m]: a car that stands sees the same again.
     pub(crate) fn learn(&mut self, seen: Self, driven: f64, distance: f64) {
-        /// More is not how a map is drawn \[m\]: a cell and a half of 5 cm.
-        const MOST_OFFSET: f64 = 0.075;
         /// More is a wrong pose \[m\].
         const MOST_SCATTER: f64 = 0.1;
         let gain = 1.0 - (-driven.abs() / distance).exp();
-        // The mean of all that was seen at first, then of the latest.
-        self.way = (self.way + driven.abs()).min(distance);
-        let share = driven.abs().min(distance) / (self.way + DRAWN);
-        self.offset = (self.offset + share * (seen.offset - self.offset)).clamp(-MOST_OFFSET, MOST_OFFSET);
+        // The mean of all that was seen at first, then of the latest. After a gap, one scan counts for no more than the drawing.
+        let way = driven.abs().min(DRAWN);
+        self.way = (self.way + way).min(distance);
+        let share = way / (self.way + DRAWN);
+        self.offset += share * (seen.offset - self.offset);
         self.scatter = (self.scatter + gain * (seen.scatter - self.scatter)).min(MOST_SCATTER);
         let learned = |old: f64, new: f64| old + gain * (new - old);
         self.shared = Shared {

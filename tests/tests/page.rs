@@ -263,7 +263,7 @@ async fn three_cars_are_shown_switched_relocated_and_lost() {
         browser
             .wait(
                 "the card shows for how long",
-                &format!("{}.innerText.match(/silent for \\d/)", card("car-1")),
+                &format!("{}.innerText.match(/\\d( s)? silent/)", card("car-1")),
             )
             .await;
         browser
@@ -798,7 +798,8 @@ async fn laps_and_health_are_compared_over_the_track() {
     let at = "((a) => { const track = a.trackOf(); const id = a.chosen[0]; return [a.valueAt(id, 'speed', track, 9), a.valueAt(id, 'lateral', track, 9), \
               a.valueAt(id, 'alignment', track, 9), a.timeAt(a.numbers(id), track, track.length / 2)]; })(pitwall.analysis)";
     let values = ana.evaluate(at).await;
-    for (i, expected, tolerance) in [(0, 9.425, 0.01), (1, 0.0, 0.01), (2, 0.9, 0.001), (3, 1.0, 0.1)] {
+    // Half a lap takes a second, or somewhat more or less where the machine is busy.
+    for (i, expected, tolerance) in [(0, 9.425, 0.01), (1, 0.0, 0.01), (2, 0.9, 0.001), (3, 1.0, 0.4)] {
         let value = number(&values[i]);
         assert!((value - expected).abs() < tolerance, "value {i}: {value}");
     }

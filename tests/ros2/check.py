@@ -36,6 +36,8 @@ PATIENCE = 20.0
 RECOVERY = 3.0
 # ... and then for so long without a break [s].
 STAYS = 1.0
+# No message takes longer from the node to the observer [s].
+ON_THE_WAY = 0.2
 # The router is back, and so are the poses, within this [s].
 ROUTER_BACK = 1.0
 
@@ -250,11 +252,11 @@ def errors(observer, car, topic, since):
     return found
 
 
-def check_poses(observer, car, namespace, since, what):
+def check_poses(observer, car, namespace, since, what, near=NEAR):
     wait(lambda: len(errors(observer, car, f"{namespace}/pf/pose/odom", since)) > 20)
     found = errors(observer, car, f"{namespace}/pf/pose/odom", since)
     mean = sum(found) / max(len(found), 1)
-    check(len(found) > 20 and mean < NEAR, f"{what}: {len(found)} poses at odometry's stamps, {100 * mean:.1f} cm off in the mean")
+    check(len(found) > 20 and mean < near, f"{what}: {len(found)} poses at odometry's stamps, {100 * mean:.1f} cm off in the mean")
 
 
 def check_outputs(observer, car, namespace=""):
@@ -455,7 +457,8 @@ def recovers(observer, car, what, words, fault, namespace="", near=NEAR):
         back = wait(settled, RECOVERY + STAYS + PATIENCE)
         took = max((observer.localized_since() or time.monotonic()) - over, 0.0)
         stalled = STALLS.total - stalls
-        off = errors(observer, car, f"{namespace}/pf/pose/odom", over + took)
+        # What was on the way when a clock was set back has stamps that come again.
+        off = errors(observer, car, f"{namespace}/pf/pose/odom", over + max(took, ON_THE_WAY))
         mean = sum(off) / max(len(off), 1)
         said = observer.log(since) + [m.status[0].message for m in observer.all("/diagnostics", since)]
         named = [word for word in words if any(word in text for text in said)]
@@ -619,7 +622,8 @@ def sweeps(program, folder, track):
         check(wait(observer.localized, 40), f"the car is localized: {observer.health()[1]}")
         since = time.monotonic()
         time.sleep(3)
-        check_poses(observer, car, "", since, "sweeps of 90 ms that are stamped at their end")
+        # As they are stamped, 25 cm off. What is left is the slow laser's: each pose is carried on over 0.1 s by odometry.
+        check_poses(observer, car, "", since, "sweeps of 90 ms that are stamped at their end", near=0.08)
     finally:
         stop(router, process, car)
 

@@ -8,9 +8,9 @@ records; the recording is then replayed and reported. Needs Chromium and the pac
 """
 
 import json
+import os
 import pathlib
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -20,9 +20,14 @@ import urllib.request
 import axe_playwright_python
 from playwright.sync_api import sync_playwright
 
+sys.path.insert(0, os.path.dirname(__file__))
+from scale import free_port, wait  # noqa: E402
+
 AXE = pathlib.Path(axe_playwright_python.__file__).with_name("axe.min.js").read_text(encoding="utf-8")
 # Each with a theme, so that both are checked.
 WIDTHS = [(390, 844, "dark"), (1366, 768, "light"), (1920, 1080, "dark")]
+# For the page, the cars and the replay [s].
+PATIENCE = 90
 SERIOUS = {"serious", "critical"}
 # Each view of the live page with what opens it.
 VIEWS = {
@@ -47,21 +52,6 @@ OPEN = """(act) => {
   press('Escape');
   eval(act);
 }"""
-
-
-def free_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
-
-
-def wait_for(what, condition, seconds=90):
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        if (value := condition()):
-            return value
-        time.sleep(0.1)
-    sys.exit(f"not within {seconds} s: {what}")
 
 
 class Checker:
@@ -121,7 +111,7 @@ def main():
         cars, page_port = f"tcp/127.0.0.1:{free_port()}", free_port()
         url = f"http://127.0.0.1:{page_port}"
         start(pitwall, "--listen", cars, "--page", f"127.0.0.1:{page_port}", "--recordings", str(folder))
-        wait_for("the page", lambda: serves(url))
+        wait("the page", lambda: serves(url), PATIENCE)
         start(test_car, "rings", "3", cars)
 
         def post(path, body):
@@ -130,7 +120,7 @@ def main():
             with urllib.request.urlopen(request, timeout=180) as answer:
                 return answer.read()
 
-        wait_for("three cars", lambda: len(serves(url)["cars"]) == 3 and all(c["health"] for c in serves(url)["cars"]))
+        wait("three cars", lambda: len(serves(url)["cars"]) == 3 and all(c["health"] for c in serves(url)["cars"]), PATIENCE)
         post("/record", {"on": True, "operator": "axe"})
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"])
@@ -147,7 +137,7 @@ def main():
             if wanted("replay"):
                 port = free_port()
                 start(pitwall, "--page", f"127.0.0.1:{port}", "replay", str(file))
-                wait_for("the replay", lambda: serves(f"http://127.0.0.1:{port}"))
+                wait("the replay", lambda: serves(f"http://127.0.0.1:{port}"), PATIENCE)
                 page = checker.open(f"http://127.0.0.1:{port}")
                 page.wait_for_function("document.querySelectorAll('.card').length === 3", timeout=90000)
                 checker.check(page, "replay")

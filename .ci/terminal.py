@@ -15,7 +15,6 @@ import pty
 import select
 import shutil
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -25,6 +24,9 @@ import time
 import urllib.request
 
 import pyte
+
+sys.path.insert(0, os.path.dirname(__file__))
+from scale import free_port, wait  # noqa: E402
 
 DEADLINE = 60
 KEYS = {"up": "\x1b[A", "down": "\x1b[B", "escape": "\x1b", "enter": "\r"}
@@ -115,21 +117,6 @@ def check(condition, what):
     print(f"ok: {what}")
 
 
-def free_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
-
-
-def wait_for(what, condition):
-    until = time.monotonic() + DEADLINE
-    while time.monotonic() < until:
-        if (value := condition()):
-            return value
-        time.sleep(0.1)
-    sys.exit(f"not within {DEADLINE} s: {what}")
-
-
 def main():
     if len(sys.argv) != 3:
         sys.exit(__doc__)
@@ -160,10 +147,10 @@ def main():
             with urllib.request.urlopen(request, timeout=60) as answer:
                 return answer.read()
 
-        wait_for("the page", snapshot)
+        wait("the page", snapshot, DEADLINE)
         start(test_car, "rings", "1", endpoint)
         racer = start(test_car, "race", "racer", "0", endpoint)
-        wait_for("two cars", lambda: len(snapshot()["cars"]) == 2 and all(car["health"] for car in snapshot()["cars"]))
+        wait("two cars", lambda: len(snapshot()["cars"]) == 2 and all(car["health"] for car in snapshot()["cars"]), DEADLINE)
 
         watch = Terminal([pitwall, "--connect", endpoint, "--operator", "ana", "watch"])
         started.append(watch)

@@ -45,6 +45,18 @@ pub struct RaceSession {
 }
 
 impl RaceSession {
+    /// Two cars that drive three laps of `club` on `hq`, and then on `lq`.
+    pub fn two_heats() -> Self {
+        Self {
+            track: "club".into(),
+            cars: 2,
+            heats: vec![("hq".into(), Quality::Hq, 3), ("lq".into(), Quality::Hq, 3)],
+            seed: 3,
+            defects: Vec::new(),
+            scans: false,
+        }
+    }
+
     /// Drives the heats and records them. Returns the results by heat and car.
     pub fn record(&self, path: &Path) -> anyhow::Result<(Vec<Vec<CarResult>>, RecordingSummary)> {
         let track = Arc::new(Track::find(&self.track, None)?);

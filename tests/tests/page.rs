@@ -9,9 +9,8 @@
 )]
 
 use std::process::{Child, Command, Stdio};
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 
-use car_node::race::Quality;
 use pitwall::{Fleet, PageOptions, PitWallOptions, PitWallServer, read_events};
 use serde_json::Value;
 use system_tests::{Behaviour, Browser, FakeCar, RaceSession, free_endpoint, router, wait_until};
@@ -509,14 +508,7 @@ async fn a_recording_is_replayed_on_the_same_page() {
     replay
         .set_playback(Some(false), Some(2.0), Some(0.5))
         .expect("valid settings");
-    let options = PageOptions {
-        address: ([127, 0, 0, 1], 0).into(),
-        ..PageOptions::default()
-    };
-    let page = pitwall::Page::serve_replay(replay.clone(), options)
-        .await
-        .expect("a page");
-    let browser = Browser::open(page.url(), 1366, 768).await;
+    let (page, browser) = page_of(&replay).await;
     let localized = format!("{}?.innerText.includes('LOCALIZED')", card("car-1"));
     browser.wait("the car drives again", &localized).await;
     browser
@@ -547,6 +539,19 @@ async fn a_recording_is_replayed_on_the_same_page() {
     drop(guard);
 }
 
+/// The page of a replay, and a browser that shows it.
+async fn page_of(replay: &Arc<pitwall::Replay>) -> (pitwall::Page, Browser) {
+    let options = PageOptions {
+        address: ([127, 0, 0, 1], 0).into(),
+        ..PageOptions::default()
+    };
+    let page = pitwall::Page::serve_replay(replay.clone(), options)
+        .await
+        .expect("a page");
+    let browser = Browser::open(page.url(), 1366, 768).await;
+    (page, browser)
+}
+
 /// The numbers in a text, in their order.
 fn numbers_in(text: &str) -> Vec<f64> {
     let parts = text.split(|c: char| !(c.is_ascii_digit() || c == '.'));
@@ -562,14 +567,7 @@ async fn a_race_has_the_same_figures_on_the_page() {
     let guard = ONE_AT_A_TIME.lock().await;
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("race.mcap");
-    let session = RaceSession {
-        track: "club".into(),
-        cars: 2,
-        heats: vec![("hq".into(), Quality::Hq, 3), ("lq".into(), Quality::Hq, 3)],
-        seed: 3,
-        defects: Vec::new(),
-        scans: false,
-    };
+    let session = RaceSession::two_heats();
     let heats = {
         let (session, file) = (session.clone(), file.clone());
         let recorded = tokio::task::spawn_blocking(move || session.record(&file)).await;
@@ -579,14 +577,7 @@ async fn a_race_has_the_same_figures_on_the_page() {
     replay
         .set_playback(Some(false), None, Some(1e6))
         .expect("its end");
-    let options = PageOptions {
-        address: ([127, 0, 0, 1], 0).into(),
-        ..PageOptions::default()
-    };
-    let page = pitwall::Page::serve_replay(replay.clone(), options)
-        .await
-        .expect("a page");
-    let browser = Browser::open(page.url(), 1366, 768).await;
+    let (page, browser) = page_of(&replay).await;
     browser.key("l").await;
     let rows = |table: &str| {
         format!(

@@ -1,6 +1,6 @@
 //! The report shows the same figures of a race as `car-node race --json`.
 
-use car_node::race::{CarResult, Quality, RaceSummary};
+use car_node::race::{CarResult, RaceSummary};
 use pitwall::Report;
 use system_tests::RaceSession;
 
@@ -22,14 +22,7 @@ fn mean(values: impl IntoIterator<Item = f64>) -> f64 {
 fn the_report_shows_the_figures_of_the_race() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("race.mcap");
-    let session = RaceSession {
-        track: "club".into(),
-        cars: 2,
-        heats: vec![("hq".into(), Quality::Hq, 3), ("lq".into(), Quality::Hq, 3)],
-        seed: 3,
-        defects: Vec::new(),
-        scans: false,
-    };
+    let session = RaceSession::two_heats();
     let (heats, _) = session.record(&file).expect("a recording");
     let report = Report::of(&file).expect("a good file");
     assert_eq!(report.cars.len(), 2);

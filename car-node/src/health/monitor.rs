@@ -210,14 +210,10 @@ impl Monitor {
         let pose_jump = self.pose_jump(update);
         if let Some(distance) = pose_jump {
             self.pose_jump = Some((now, distance));
-            // The fit before the jump is that of another pose.
-            self.fit = None;
         }
-        if self
-            .fit
-            .is_some_and(|[_, fast]| update.alignment > fast.alignment + FOUND)
-        {
-            // So is that of a pose that the localizer has given up for one that fits.
+        // The fit before a jump is that of another pose; so is that before the localizer gave its pose up for one that fits.
+        let fits = |[_, fast]: [ScanFit; 2]| update.alignment > fast.alignment + FOUND;
+        if pose_jump.is_some() || self.fit.is_some_and(fits) {
             self.fit = None;
         }
         // STALE ends first, so that this scan already counts for the state after it.

@@ -2,9 +2,10 @@
 //!
 //! A map's face is the near edge of the cells that end points fell into, so walls stand up to a cell behind it, and the fit
 //! would be pushed away from whatever is on one side only. Maps that were smoothed or cleaned by hand are farther off: by 4 and
-//! 5 cm on two real ones. A laser looks ahead, so that all walls too far behind push the pose back. And a set tuned for one laser and a good map claims too much with
-//! another: with end points that scatter by 5 cm in place of 2, a fit that goes by `refine_sigma` alone takes noise for
-//! structure along a straight.
+//! 5 cm on two real ones. A laser looks ahead, so that walls too near on the map push the pose back.
+//!
+//! And a set tuned for one laser and a good map claims too much with another: with end points that scatter by 5 cm in place of
+//! 2, a fit that goes by `refine_sigma` alone takes noise for structure along a straight.
 
 use maps::{DistanceField, Pose};
 use nalgebra::{Matrix4, Vector4};
@@ -167,7 +168,6 @@ impl WallCalibration {
         let sound = on_walls as f64 >= LEAST_SHARE * looked_at as f64 && offset.abs() <= MOST_OFFSET;
         Some(Self {
             offset: if sound { offset } else { known.offset },
-            way: known.way,
             scatter: f64::from(*median * SIGMA_OF_MEDIAN),
             // Of the points between those looked at, each has the same in common with its stretch.
             shared: Shared {
@@ -176,6 +176,7 @@ impl WallCalibration {
                 view: f64::from(view / total),
                 step: 0.0,
             },
+            ..known
         })
     }
 

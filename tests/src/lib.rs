@@ -18,9 +18,7 @@ mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
-pub use bystanders::{
-    alone, attack_factor, is_named, log_has, nothing_is_lost, received, the_streams_stay_complete, three_cars,
-};
+pub use bystanders::{alone, attack_factor, is_named, log_has, nothing_is_lost, received, three_cars};
 pub use fake_car::{Behaviour, FakeCar};
 pub use link::Link;
 pub use race_session::RaceSession;

@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use base64::Engine;
@@ -12,10 +13,10 @@ use pitwall::{FleetService, unix_now};
 use protocol::{Action, Answer, CarName, Command, CommandId, Key, Outcome, Stamps, Topic, decode, encode};
 use system_tests::{
     Behaviour, FakeCar, alone, attack_factor as times, client, free_endpoint, in_force, is_named, log_has,
-    named, nothing_is_lost, router, select, send_command, start_real_protected, the_streams_stay_complete,
-    three_cars, wait_until,
+    named, nothing_is_lost, router, select, send_command, start_real_protected, three_cars, wait_until,
 };
 use zenoh::Session;
+use zenoh::qos::CongestionControl;
 
 /// A team with a laptop, three cars, one that does harm, and a viewer.
 fn team() -> Authority {
@@ -51,31 +52,46 @@ async fn pit_wall(authority: &Authority, endpoint: &str) -> Arc<FleetService> {
 
 /// A session that follows no rules but those of the other side. None when it is not let in.
 async fn session(endpoint: &str, protection: &Protection) -> Option<Session> {
-    let settings = protection.settings(&Side::Client).expect("settings");
-    let rules = settings
+    session_with(client_of(endpoint), protection).await
+}
+
+async fn session_with<const N: usize>(
+    settings: [(&'static str, String); N],
+    protection: &Protection,
+) -> Option<Session> {
+    let protected = protection.settings(&Side::Client).expect("settings");
+    let rules = protected
         .entries
-        .iter()
+        .into_iter()
         .filter(|(key, _)| *key != "access_control");
-    open(endpoint, rules.cloned().collect()).await
+    open(settings.into_iter().chain(rules)).await
 }
 
 /// The same, encrypted for a host of the team, which shows no certificate.
 async fn session_without_certificate(endpoint: &str, authority: &Authority) -> Option<Session> {
     let team = BASE64_STANDARD.encode(authority.certificate());
     let tls = serde_json::json!({"root_ca_certificate_base64": team, "verify_name_on_connect": false});
-    open(endpoint, vec![("transport/link/tls", tls.to_string())]).await
+    open(
+        client_of(endpoint)
+            .into_iter()
+            .chain([("transport/link/tls", tls.to_string())]),
+    )
+    .await
 }
 
-async fn open(endpoint: &str, rules: Vec<(&'static str, String)>) -> Option<Session> {
-    let mut config = zenoh::Config::default();
-    let plain = [
+fn client_of(endpoint: &str) -> [(&'static str, String); 4] {
+    [
         ("mode", r#""client""#.to_owned()),
         ("connect/endpoints", format!(r#"["{endpoint}"]"#)),
         ("connect/timeout_ms", "1500".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-    ];
-    for (key, value) in plain.iter().chain(&rules) {
-        config.insert_json5(key, value).expect("a good setting");
+    ]
+}
+
+async fn open(settings: impl Iterator<Item = (&'static str, String)>) -> Option<Session> {
+    let mut config = zenoh::Config::default();
+    for (key, value) in settings {
+        config.insert_json5(key, &value).expect("a good setting");
     }
     zenoh::open(config).await.ok()
 }
@@ -413,6 +429,58 @@ async fn failed_handshakes_hold_nobody_up() {
     wall.close().await;
 }
 
+/// Reading and writing share one TLS session, which broke where both happened at once: the link ended, and messages were lost.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_link_with_keys_carries_both_ways_at_once() {
+    const SENT: usize = 100_000;
+    let _alone = alone().await;
+    let authority = team();
+    let endpoint = free_tls_endpoint();
+    let listen = [
+        ("mode", r#""router""#.to_owned()),
+        ("listen/endpoints", format!(r#"["{endpoint}"]"#)),
+        ("scouting/multicast/enabled", "false".to_owned()),
+    ];
+    let laptop = keys_of(&authority, Role::Pit, "laptop");
+    let near = session_with(listen, &laptop).await.expect("a router");
+    let far = session(&endpoint, &keys_of(&authority, Role::Car, "car-1"))
+        .await
+        .expect("let in");
+    let mut arrived = Vec::new();
+    for (session, key) in [(&near, "up"), (&far, "down")] {
+        let count = Arc::new(AtomicUsize::new(0));
+        arrived.push(count.clone());
+        session
+            .declare_subscriber(key)
+            .callback(move |_| {
+                count.fetch_add(1, Ordering::Relaxed);
+            })
+            .background()
+            .await
+            .expect("subscribed");
+    }
+    for (session, key) in [(&far, "up"), (&near, "down")] {
+        let publisher = session
+            .declare_publisher(key)
+            .congestion_control(CongestionControl::Block)
+            .await
+            .expect("a publisher");
+        let matched = async || publisher.matching_status().await.expect("a status").matching();
+        while !matched().await {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        tokio::spawn(async move {
+            for _ in 0..SENT {
+                publisher.put([0; 100]).await.expect("sent");
+            }
+        });
+    }
+    wait_until("everything has arrived", || {
+        arrived.iter().all(|count| count.load(Ordering::Relaxed) == SENT)
+    })
+    .await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_passphrase_lets_in_whoever_knows_it() {
     let _alone = alone().await;
@@ -475,7 +543,7 @@ async fn a_flood_of_commands_is_named_and_others_are_served() {
             .await
             .expect("sent");
     }
-    the_streams_stay_complete(&wall, &cars).await;
+    nothing_is_lost(&wall, &cars).await;
     let verdict = send_command(&wall, &car, "ana", None, select("lq")).await;
     assert_eq!(verdict.exit_code(), 0, "{verdict:?}");
     is_named(&wall, "unknown sends more than 20 commands a second").await;

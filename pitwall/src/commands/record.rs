@@ -25,6 +25,7 @@ pub(super) async fn record(
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let service = open(network).await?;
+    service.fleet().keep_only_newest();
     let file = if let Some(file) = file {
         file
     } else {

@@ -64,6 +64,8 @@ pub struct Car {
     pub map: Option<(Arc<MapReply>, Arc<[u8]>)>,
     /// The software on it.
     pub info: Option<CarInfo>,
+    /// True when only the newest messages are kept, see [`Fleet::keep_only_newest`](super::Fleet::keep_only_newest).
+    pub(super) only_newest: bool,
     /// Whether the full-rate poses and the full-rate health messages are shown in place of the live ones.
     complete: [bool; 2],
     /// When the recording of each run begins, by the car's clock \[unix ns\]. Laps that ended before it are left out.
@@ -114,6 +116,7 @@ impl Car {
             truth: None,
             map: None,
             info: None,
+            only_newest: false,
             complete: [false; 2],
             laps_since: BTreeMap::new(),
             laps: LapTimer::default(),
@@ -141,11 +144,36 @@ impl Car {
         if !is_new {
             return false;
         }
+        // Live, the full-rate pose is the same pose again, held back until gaps are filled: not for display.
+        if matches!(telemetry, Telemetry::Pose(_) | Telemetry::Health(_)) && !self.shows(topic) {
+            return true;
+        }
+        if !self.only_newest {
+            self.analyse(header, telemetry, at);
+        }
+        self.keep(header, telemetry);
+        true
+    }
+
+    /// Keeps the newest message of each kind.
+    fn keep(&mut self, header: &Header, telemetry: &Telemetry) {
         match telemetry {
-            // Live, the full-rate pose is the same pose again, held back until gaps are filled: not for display.
-            Telemetry::Pose(_) | Telemetry::Health(_) if !self.shows(topic) => {}
+            Telemetry::Pose(pose) => self.pose = Some((*header, *pose)),
+            Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
+            Telemetry::Scan(scan) => self.scan = Some(scan.clone()),
+            Telemetry::Health(health) => self.health = Some(health.clone()),
+            Telemetry::Load(load) => self.load = Some(load.clone()),
+            Telemetry::Params(params) => self.params = Some(params.clone()),
+            Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
+            Telemetry::Truth(truth) => self.truth = Some(*truth),
+            Telemetry::Event(_) | Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
+        }
+    }
+
+    /// Adds a message that arrived at `at` \[unix ns\] to the laps, the history and the map check.
+    fn analyse(&mut self, header: &Header, telemetry: &Telemetry, at: i64) {
+        match telemetry {
             Telemetry::Pose(pose) => {
-                self.pose = Some((*header, *pose));
                 if let Some(sample) = PoseSample::of(header, pose) {
                     if let Some(length) = self.lap_length() {
                         self.laps.on_pose(&sample, length);
@@ -156,7 +184,6 @@ impl Car {
                     }
                 }
             }
-            Telemetry::Cloud(cloud) => self.cloud = Some(cloud.clone()),
             Telemetry::Scan(scan) => {
                 let trusted = |health: &Health| matches!(health.state, State::Localized | State::Degraded);
                 if let Some(check) = &mut self.map_check
@@ -164,7 +191,6 @@ impl Car {
                 {
                     check.on_scan(scan);
                 }
-                self.scan = Some(scan.clone());
             }
             Telemetry::Health(health) => {
                 self.history.add(at, health);
@@ -174,15 +200,8 @@ impl Car {
                 if let (Some(s), Some(length)) = (s, self.lap_length()) {
                     self.health_profile.add(s, length, health);
                 }
-                self.health = Some(health.clone());
             }
-            Telemetry::Load(load) => {
-                self.book.on_load(load);
-                self.load = Some(load.clone());
-            }
-            Telemetry::Params(params) => self.params = Some(params.clone()),
-            Telemetry::Shadow(shadow) => self.shadow = Some(shadow.clone()),
-            Telemetry::Truth(truth) => self.truth = Some(*truth),
+            Telemetry::Load(load) => self.book.on_load(load),
             Telemetry::Event(event) => {
                 let since = self.laps_since.get(&header.run_id);
                 let ended_before = matches!(event.kind, EventKind::Lap { .. })
@@ -192,9 +211,8 @@ impl Car {
                     self.laps.on_event(&event.kind);
                 }
             }
-            Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => {}
+            _ => {}
         }
-        true
     }
 
     /// True when the messages of a topic are shown: for poses and health, the live or the full-rate ones.

@@ -43,6 +43,8 @@ pub struct Fleet {
     limits: BTreeMap<String, Limits>,
     /// When cars beyond the limit were last reported \[unix ns\].
     too_many_reported: Option<i64>,
+    /// True when nobody looks at the laps.
+    only_newest: bool,
 }
 
 impl Fleet {
@@ -55,12 +57,7 @@ impl Fleet {
 
     /// Applies an event.
     pub fn apply(&mut self, event: &FleetEvent) {
-        let FleetEvent {
-            at,
-            car: name,
-            payload,
-        } = event;
-        let at = *at;
+        let (at, name, payload) = (event.at, &event.car, &event.payload);
         if !self.make_room(name, payload, at) {
             return;
         }
@@ -73,6 +70,7 @@ impl Fleet {
             if let Some((complete, laps_since)) = self.expected.get(name) {
                 car.read_from(*complete, laps_since.clone());
             }
+            car.only_newest = self.only_newest;
             car
         });
         match payload {
@@ -169,6 +167,15 @@ impl Fleet {
     /// Prepares a car that is about to be read from a recording, see [`Car::read_from`].
     pub(crate) fn read_from(&mut self, name: CarName, complete: [bool; 2], laps_since: BTreeMap<u64, i64>) {
         self.expected.insert(name, (complete, laps_since));
+    }
+
+    /// Keeps only the newest messages of each car from now on: no laps, no history and no map check, which take time with each
+    /// message and memory with each lap. For a recorder that nobody looks at.
+    pub fn keep_only_newest(&mut self) {
+        self.only_newest = true;
+        for car in self.cars.values_mut() {
+            car.only_newest = true;
+        }
     }
 
     /// Forgets what arrived of the full-rate streams, because nobody has listened to them since.
@@ -476,6 +483,34 @@ mod tests {
             at,
             car: name(),
             payload: EventPayload::Appeared,
+        }
+    }
+
+    // A recorder that nobody looks at once kept every lap of every car.
+    #[test]
+    fn only_the_newest_messages_are_kept_where_nobody_looks() {
+        for only_newest in [false, true] {
+            let mut fleet = Fleet::default();
+            if only_newest {
+                fleet.keep_only_newest();
+            }
+            let health = Health {
+                state: State::Localized,
+                since: 0,
+                causes: Vec::new(),
+                update: 1,
+                metrics: Some(protocol::Metrics::default()),
+                proposal: None,
+                auto: false,
+            };
+            for number in 1..=100 {
+                let telemetry = Telemetry::Health(health.clone());
+                let at = number as i64 * SECOND;
+                fleet.apply(&message(at, number, Delivery::Live, Topic::Health, telemetry));
+            }
+            let car = fleet.car(&name()).expect("known");
+            assert!(car.health.is_some());
+            assert_eq!(car.history().count(), if only_newest { 0 } else { 100 });
         }
     }
 

@@ -1,85 +1,116 @@
 //! Converts messages to JSON for other tools, in Foxglove's schemas if there is one.
+//!
+//! Most of what is recorded passes here. So the messages are structs that are written as they are, and no tree of values is
+//! built for each.
+
+use std::fmt;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use protocol::{
-    CarName, Cloud, Event, EventKind, Header, MapReply, Pose, Pose2, ScanView, Severity, Telemetry,
-};
+use protocol::{CarName, Cloud, Event, EventKind, Header, MapReply, Pose2, ScanView, Severity, Telemetry};
+use serde::Serialize;
 use serde_json::{Value, json};
 
-/// One message in JSON.
-pub(super) struct Exported {
-    /// The last part of the channel, after `/<car>/`.
-    pub(super) channel: &'static str,
-    /// Name of the schema.
-    pub(super) schema: &'static str,
-    /// The message.
-    pub(super) json: Value,
+/// Writes JSON messages.
+pub(super) trait JsonSink {
+    /// Why a message cannot be written.
+    type Error;
+
+    /// Writes a message. `channel` is the last part of the channel, after `/<car>/`; `schema` is the name of the schema.
+    fn write(
+        &mut self,
+        channel: &'static str,
+        schema: &'static str,
+        message: &impl Serialize,
+    ) -> Result<(), Self::Error>;
 }
 
-/// The JSON messages for a message on a live topic.
-pub(super) fn export(car: &CarName, header: &Header, telemetry: &Telemetry) -> Vec<Exported> {
-    let exported = |channel, schema, json| Exported {
-        channel,
-        schema,
-        json,
-    };
-    let time = timestamp(header.sensor);
+/// Writes the JSON messages for a message on a live topic.
+pub(super) fn export<S: JsonSink>(
+    car: &CarName,
+    header: &Header,
+    telemetry: &Telemetry,
+    sink: &mut S,
+) -> Result<(), S::Error> {
+    let timestamp = Timestamp::of(header.sensor);
     match telemetry {
-        Telemetry::Pose(pose) => vec![
-            exported(
+        Telemetry::Pose(pose) => {
+            sink.write(
                 "pose",
                 "foxglove.PoseInFrame",
-                json!({"timestamp": time, "frame_id": "map", "pose": pose_json(pose.pose)}),
-            ),
-            exported("tf", "foxglove.FrameTransform", transform(car, &time, pose)),
-            exported("state", "synpf.Pose", stamped(&time, pose)),
-        ],
-        Telemetry::Cloud(cloud) => vec![exported(
+                &PoseInFrame::new(timestamp, pose.pose),
+            )?;
+            sink.write(
+                "tf",
+                "foxglove.FrameTransform",
+                &FrameTransform::new(timestamp, car, pose.pose),
+            )?;
+            sink.write("state", "synpf.Pose", &Stamped::new(timestamp, pose))
+        }
+        Telemetry::Cloud(cloud) => sink.write(
             "cloud",
             "foxglove.PosesInFrame",
-            particles(&time, cloud),
-        )],
-        Telemetry::Scan(scan) => vec![exported("scan", "foxglove.PointCloud", end_points(&time, scan))],
-        Telemetry::Health(health) => vec![exported("health", "synpf.Health", stamped(&time, health))],
-        Telemetry::Load(load) => vec![exported("load", "synpf.Load", stamped(&time, load))],
-        Telemetry::Params(params) => vec![exported("params", "synpf.Params", stamped(&time, params))],
-        Telemetry::Shadow(shadow) => vec![exported("shadow", "synpf.Shadow", stamped(&time, shadow))],
+            &PosesInFrame {
+                timestamp,
+                frame_id: MAP,
+                poses: Particles(cloud),
+            },
+        ),
+        Telemetry::Scan(scan) => sink.write(
+            "scan",
+            "foxglove.PointCloud",
+            &PointCloud {
+                timestamp,
+                frame_id: MAP,
+                pose: Pose2::default().into(),
+                point_stride: 13,
+                fields: [
+                    PackedField::new("x", 0, NumericType::Float32),
+                    PackedField::new("y", 4, NumericType::Float32),
+                    PackedField::new("z", 8, NumericType::Float32),
+                    PackedField::new("kind", 12, NumericType::Uint8),
+                ],
+                data: BASE64.encode(end_points(scan)),
+            },
+        ),
+        Telemetry::Health(health) => sink.write("health", "synpf.Health", &Stamped::new(timestamp, health)),
+        Telemetry::Load(load) => sink.write("load", "synpf.Load", &Stamped::new(timestamp, load)),
+        Telemetry::Params(params) => sink.write("params", "synpf.Params", &Stamped::new(timestamp, params)),
+        Telemetry::Shadow(shadow) => sink.write("shadow", "synpf.Shadow", &Stamped::new(timestamp, shadow)),
         Telemetry::Event(event) => {
-            let time = timestamp(if header.sensor == 0 {
+            let at = if header.sensor == 0 {
                 header.published
             } else {
                 header.sensor
-            });
-            vec![exported("event", "foxglove.Log", log_line(car, &time, event))]
+            };
+            sink.write("event", "foxglove.Log", &Log::new(Timestamp::of(at), car, event))
         }
-        Telemetry::Truth(truth) => vec![exported(
+        Telemetry::Truth(truth) => sink.write(
             "truth",
             "foxglove.PoseInFrame",
-            json!({"timestamp": time, "frame_id": "map", "pose": pose_json(truth.pose)}),
-        )],
-        Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => Vec::new(),
+            &PoseInFrame::new(timestamp, truth.pose),
+        ),
+        Telemetry::Odometry(_) | Telemetry::RecordedScan(_) => Ok(()),
     }
 }
 
-/// The map as JSON.
-pub(super) fn export_map(map: &MapReply, at: i64) -> Exported {
-    let data = map.occupancy();
-    Exported {
-        channel: "map",
-        schema: "foxglove.Grid",
-        json: json!({
-            "timestamp": timestamp(at),
-            "frame_id": "map",
-            "pose": pose_json(map.origin),
-            "column_count": map.width,
-            "cell_size": {"x": map.resolution, "y": map.resolution},
-            "row_stride": map.width,
-            "cell_stride": 1,
-            "fields": [{"name": "occupancy", "offset": 0, "type": NumericType::Uint8 as u8}],
-            "data": BASE64.encode(data),
-        }),
-    }
+/// Writes the map as JSON.
+pub(super) fn export_map<S: JsonSink>(map: &MapReply, at: i64, sink: &mut S) -> Result<(), S::Error> {
+    let grid = Grid {
+        timestamp: Timestamp::of(at),
+        frame_id: MAP,
+        pose: map.origin.into(),
+        column_count: map.width,
+        cell_size: CellSize {
+            x: map.resolution,
+            y: map.resolution,
+        },
+        row_stride: map.width,
+        cell_stride: 1,
+        fields: [PackedField::new("occupancy", 0, NumericType::Uint8)],
+        data: BASE64.encode(map.occupancy()),
+    };
+    sink.write("map", "foxglove.Grid", &grid)
 }
 
 /// The JSON schema of a message with this name, made from `example`.
@@ -116,6 +147,9 @@ fn shape(value: &Value) -> Value {
     }
 }
 
+/// The frame of all poses.
+const MAP: &str = "map";
+
 /// Foxglove's numbers for the types of packed fields.
 #[derive(Clone, Copy)]
 enum NumericType {
@@ -123,43 +157,179 @@ enum NumericType {
     Float32 = 7,
 }
 
-fn timestamp(unix_ns: i64) -> Value {
-    let unix_ns = unix_ns.max(0);
-    json!({"sec": unix_ns / 1_000_000_000, "nsec": unix_ns % 1_000_000_000})
+#[derive(Clone, Copy, Serialize)]
+struct Timestamp {
+    sec: i64,
+    nsec: i64,
 }
 
-fn quaternion(heading: f64) -> Value {
-    let (sin, cos) = (heading / 2.0).sin_cos();
-    json!({"x": 0.0, "y": 0.0, "z": sin, "w": cos})
+impl Timestamp {
+    fn of(unix_ns: i64) -> Self {
+        let unix_ns = unix_ns.max(0);
+        Self {
+            sec: unix_ns / 1_000_000_000,
+            nsec: unix_ns % 1_000_000_000,
+        }
+    }
 }
 
-fn pose_json(pose: Pose2) -> Value {
-    json!({
-        "position": {"x": pose.x, "y": pose.y, "z": 0.0},
-        "orientation": quaternion(pose.heading),
-    })
+#[derive(Serialize)]
+struct Vector3 {
+    x: f64,
+    y: f64,
+    z: f64,
 }
 
-fn transform(car: &CarName, time: &Value, pose: &Pose) -> Value {
-    json!({
-        "timestamp": time,
-        "parent_frame_id": "map",
-        "child_frame_id": format!("{car}/base_link"),
-        "translation": {"x": pose.pose.x, "y": pose.pose.y, "z": 0.0},
-        "rotation": quaternion(pose.pose.heading),
-    })
+#[derive(Serialize)]
+struct Quaternion {
+    x: f64,
+    y: f64,
+    z: f64,
+    w: f64,
 }
 
-fn particles(time: &Value, cloud: &Cloud) -> Value {
-    let poses: Vec<_> = cloud
-        .particles
-        .iter()
-        .map(|&particle| pose_json(cloud.pose(particle)))
-        .collect();
-    json!({"timestamp": time, "frame_id": "map", "poses": poses})
+impl Quaternion {
+    fn of(heading: f64) -> Self {
+        let (sin, cos) = (heading / 2.0).sin_cos();
+        Self {
+            x: 0.0,
+            y: 0.0,
+            z: sin,
+            w: cos,
+        }
+    }
 }
 
-fn end_points(time: &Value, scan: &ScanView) -> Value {
+#[derive(Serialize)]
+struct PoseMessage {
+    position: Vector3,
+    orientation: Quaternion,
+}
+
+impl From<Pose2> for PoseMessage {
+    fn from(pose: Pose2) -> Self {
+        Self {
+            position: Vector3 {
+                x: pose.x,
+                y: pose.y,
+                z: 0.0,
+            },
+            orientation: Quaternion::of(pose.heading),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct PoseInFrame {
+    timestamp: Timestamp,
+    frame_id: &'static str,
+    pose: PoseMessage,
+}
+
+impl PoseInFrame {
+    fn new(timestamp: Timestamp, pose: Pose2) -> Self {
+        Self {
+            timestamp,
+            frame_id: MAP,
+            pose: pose.into(),
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct FrameTransform<'a> {
+    timestamp: Timestamp,
+    parent_frame_id: &'static str,
+    child_frame_id: Text<BaseLink<'a>>,
+    translation: Vector3,
+    rotation: Quaternion,
+}
+
+impl<'a> FrameTransform<'a> {
+    fn new(timestamp: Timestamp, car: &'a CarName, pose: Pose2) -> Self {
+        let PoseMessage {
+            position,
+            orientation,
+        } = pose.into();
+        Self {
+            timestamp,
+            parent_frame_id: MAP,
+            child_frame_id: Text(BaseLink(car)),
+            translation: position,
+            rotation: orientation,
+        }
+    }
+}
+
+/// The name of a car's frame.
+struct BaseLink<'a>(&'a CarName);
+
+impl fmt::Display for BaseLink<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/base_link", self.0)
+    }
+}
+
+/// Something that can be displayed, as a string.
+struct Text<T>(T);
+
+impl<T: fmt::Display> Serialize for Text<T> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(&self.0)
+    }
+}
+
+#[derive(Serialize)]
+struct PosesInFrame<'a> {
+    timestamp: Timestamp,
+    frame_id: &'static str,
+    poses: Particles<'a>,
+}
+
+/// The poses of a cloud.
+struct Particles<'a>(&'a Cloud);
+
+impl Serialize for Particles<'_> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let cloud = self.0;
+        serializer.collect_seq(
+            cloud
+                .particles
+                .iter()
+                .map(|&particle| PoseMessage::from(cloud.pose(particle))),
+        )
+    }
+}
+
+#[derive(Serialize)]
+struct PackedField {
+    name: &'static str,
+    offset: u32,
+    r#type: u8,
+}
+
+impl PackedField {
+    fn new(name: &'static str, offset: u32, kind: NumericType) -> Self {
+        Self {
+            name,
+            offset,
+            r#type: kind as u8,
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct PointCloud {
+    timestamp: Timestamp,
+    frame_id: &'static str,
+    pose: PoseMessage,
+    point_stride: u32,
+    fields: [PackedField; 4],
+    data: String,
+}
+
+/// The end points of a scan in the layout of [`PointCloud`].
+fn end_points(scan: &ScanView) -> Vec<u8> {
     let mut data = Vec::with_capacity(scan.points.len() * 13);
     for &end_point in &scan.points {
         for coordinate in scan.point(end_point) {
@@ -168,58 +338,79 @@ fn end_points(time: &Value, scan: &ScanView) -> Value {
         data.extend_from_slice(&0f32.to_le_bytes());
         data.push(end_point.kind.into());
     }
-    let float = NumericType::Float32 as u8;
-    json!({
-        "timestamp": time,
-        "frame_id": "map",
-        "pose": pose_json(Pose2::default()),
-        "point_stride": 13,
-        "fields": [
-            {"name": "x", "offset": 0, "type": float},
-            {"name": "y", "offset": 4, "type": float},
-            {"name": "z", "offset": 8, "type": float},
-            {"name": "kind", "offset": 12, "type": NumericType::Uint8 as u8},
-        ],
-        "data": BASE64.encode(data),
-    })
+    data
 }
 
-fn log_line(car: &CarName, time: &Value, event: &Event) -> Value {
-    let level = match event.kind.severity() {
-        Severity::Info => 2,
-        Severity::Warning => 3,
-        Severity::Critical => 4,
-    };
-    let who = event
-        .who
-        .as_ref()
-        .map_or_else(String::new, |who| format!(" [{who}]"));
-    let level = if matches!(event.kind, EventKind::Error { .. }) {
-        5
-    } else {
-        level
-    };
-    json!({
-        "timestamp": time,
-        "level": level,
-        "message": format!("{}{who}", event.kind),
-        "name": car,
-        "file": "",
-        "line": event.update,
-    })
+#[derive(Serialize)]
+struct CellSize {
+    x: f64,
+    y: f64,
+}
+
+#[derive(Serialize)]
+struct Grid {
+    timestamp: Timestamp,
+    frame_id: &'static str,
+    pose: PoseMessage,
+    column_count: u32,
+    cell_size: CellSize,
+    row_stride: u32,
+    cell_stride: u32,
+    fields: [PackedField; 1],
+    data: String,
+}
+
+#[derive(Serialize)]
+struct Log<'a> {
+    timestamp: Timestamp,
+    level: u8,
+    message: String,
+    name: &'a CarName,
+    file: &'static str,
+    line: u64,
+}
+
+impl<'a> Log<'a> {
+    fn new(timestamp: Timestamp, car: &'a CarName, event: &Event) -> Self {
+        let level = match event.kind.severity() {
+            _ if matches!(event.kind, EventKind::Error { .. }) => 5,
+            Severity::Info => 2,
+            Severity::Warning => 3,
+            Severity::Critical => 4,
+        };
+        let who = event
+            .who
+            .as_ref()
+            .map_or_else(String::new, |who| format!(" [{who}]"));
+        Self {
+            timestamp,
+            level,
+            message: format!("{}{who}", event.kind),
+            name: car,
+            file: "",
+            line: event.update,
+        }
+    }
 }
 
 /// One of our own messages, with its time.
-fn stamped(time: &Value, message: &impl serde::Serialize) -> Value {
-    let mut json = serde_json::to_value(message).unwrap_or_else(|error| json!({"error": error.to_string()}));
-    json["timestamp"] = time.clone();
-    json
+#[derive(Serialize)]
+struct Stamped<'a, M> {
+    timestamp: Timestamp,
+    #[serde(flatten)]
+    message: &'a M,
+}
+
+impl<'a, M> Stamped<'a, M> {
+    fn new(timestamp: Timestamp, message: &'a M) -> Self {
+        Self { timestamp, message }
+    }
 }
 
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use protocol::{Covariance, PoseKind, Twist2};
+    use protocol::{Covariance, Pose, PoseKind, Twist2};
 
     pub(in super::super) fn pose() -> Pose {
         Pose {
@@ -239,7 +430,7 @@ pub(super) mod tests {
 
     #[test]
     fn a_schema_describes_its_message() {
-        let message = json!({"timestamp": timestamp(1_500_000_000), "x": 1.5, "names": ["a"], "data": "AA==", "no": null});
+        let message = json!({"timestamp": Timestamp::of(1_500_000_000), "x": 1.5, "names": ["a"], "data": "AA==", "no": null});
         assert_eq!(
             schema("test", &message),
             json!({
@@ -258,9 +449,7 @@ pub(super) mod tests {
 
     #[test]
     fn a_quarter_turn_is_a_quaternion() {
-        let z = quaternion(std::f64::consts::FRAC_PI_2)["z"]
-            .as_f64()
-            .expect("a number");
+        let z = Quaternion::of(std::f64::consts::FRAC_PI_2).z;
         assert!((z - std::f64::consts::FRAC_1_SQRT_2).abs() < 1e-12);
     }
 }

@@ -1,13 +1,15 @@
 //! Writes one recording.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
+use std::fmt::Write as _;
 use std::io::{Seek, Write};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{WriteOptions, Writer};
 use protocol::{CarName, Key, Telemetry, Topic};
+use serde::Serialize;
 
-use super::foxglove::{self, Exported};
+use super::foxglove::{self, JsonSink};
 use super::note::Note;
 use super::session::Session;
 use super::summary::{RecordingSummary, StreamSummary};
@@ -18,6 +20,9 @@ use crate::fleet::{SequenceStatus, SequenceTracker};
 pub(super) const WIRE_ENCODING: &str = "synpf-v1";
 /// Name of the metadata record with the gaps of each stream.
 pub(super) const SUMMARY_RECORD: &str = "pitwall.streams";
+
+/// Largest chunk [bytes]: more than fifty cars send between two syncs.
+const CHUNK: u64 = 8_000_000;
 
 /// A stream being recorded.
 #[derive(Default)]
@@ -53,6 +58,8 @@ pub(super) struct RecordingWriter<W: Write + Seek> {
     messages: u64,
     first: Option<i64>,
     last: Option<i64>,
+    /// For the name of a channel and a message: their memory is used again.
+    buffers: (String, Vec<u8>),
 }
 
 impl<W: Write + Seek> RecordingWriter<W> {
@@ -71,6 +78,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
             messages: 0,
             first: None,
             last: None,
+            buffers: Default::default(),
         })
     }
 
@@ -197,9 +205,8 @@ impl<W: Write + Seek> RecordingWriter<W> {
                     let arrived = offset.map_or(*at, |(_, offset)| {
                         header.published.saturating_sub(*offset).min(*at)
                     });
-                    for exported in foxglove::export(car, header, telemetry) {
-                        self.write_json(car, &exported, Times { arrived, ..times })?;
-                    }
+                    let times = Times { arrived, ..times };
+                    foxglove::export(car, header, telemetry, &mut self.json(car, times))?;
                 }
             }
             EventPayload::Map { map, bytes } => {
@@ -213,7 +220,7 @@ impl<W: Write + Seek> RecordingWriter<W> {
                     sequence: 0,
                 };
                 self.write_to(&name, WIRE_ENCODING, 0, times, bytes)?;
-                self.write_json(car, &foxglove::export_map(map, *at), times)?;
+                foxglove::export_map(map, *at, &mut self.json(car, times))?;
             }
             other => {
                 match other {
@@ -326,30 +333,13 @@ impl<W: Write + Seek> RecordingWriter<W> {
         self.write_to(&Note::channel(car), "json", 0, times, &json)
     }
 
-    fn write_json(
-        &mut self,
-        car: &CarName,
-        exported: &Exported,
-        times: Times,
-    ) -> Result<(), mcap::McapError> {
-        let schema = if let Some(&schema) = self.schemas.get(exported.schema) {
-            schema
-        } else {
-            let text = foxglove::schema(exported.schema, &exported.json).to_string();
-            let schema = self
-                .writer
-                .add_schema(exported.schema, "jsonschema", text.as_bytes())?;
-            self.schemas.insert(exported.schema, schema);
-            schema
-        };
-        let channel = format!("/{car}/{}", exported.channel);
-        self.write_to(
-            &channel,
-            "json",
-            schema,
+    /// Where the JSON messages of a car at these times go.
+    fn json<'a>(&'a mut self, car: &'a CarName, times: Times) -> JsonChannels<'a, W> {
+        JsonChannels {
+            recording: self,
+            car,
             times,
-            exported.json.to_string().as_bytes(),
-        )
+        }
     }
 
     fn write_to(
@@ -379,16 +369,56 @@ impl<W: Write + Seek> RecordingWriter<W> {
     }
 }
 
+/// The JSON channels of a car.
+struct JsonChannels<'a, W: Write + Seek> {
+    recording: &'a mut RecordingWriter<W>,
+    car: &'a CarName,
+    times: Times,
+}
+
+impl<W: Write + Seek> JsonSink for JsonChannels<'_, W> {
+    type Error = mcap::McapError;
+
+    fn write(
+        &mut self,
+        channel: &'static str,
+        schema: &'static str,
+        message: &impl Serialize,
+    ) -> Result<(), mcap::McapError> {
+        let recording = &mut *self.recording;
+        let json = |e: serde_json::Error| mcap::McapError::Io(e.into());
+        let id = if let Some(&id) = recording.schemas.get(schema) {
+            id
+        } else {
+            let example = serde_json::to_value(message).map_err(json)?;
+            let text = foxglove::schema(schema, &example).to_string();
+            let id = recording
+                .writer
+                .add_schema(schema, "jsonschema", text.as_bytes())?;
+            recording.schemas.insert(schema, id);
+            id
+        };
+        let (mut name, mut text) = std::mem::take(&mut recording.buffers);
+        name.clear();
+        text.clear();
+        // Writing to a string does not fail.
+        write!(name, "/{}/{channel}", self.car).ok();
+        let written = serde_json::to_writer(&mut text, message)
+            .map_err(json)
+            .and_then(|()| recording.write_to(&name, "json", id, self.times, &text));
+        recording.buffers = (name, text);
+        written
+    }
+}
+
 /// The sensor times of the poses and health messages that the JSON channels of a car have \[unix ns\].
 #[derive(Default)]
 struct ExportedTimes {
-    poses: BTreeSet<i64>,
-    healths: BTreeSet<i64>,
+    poses: RecentTimes,
+    healths: RecentTimes,
 }
 
 impl ExportedTimes {
-    /// Beyond this many, the oldest are forgotten: hours of poses, longer than a car keeps them.
-    const MOST: usize = 500_000;
     /// Live health messages are this far apart, so that a hole is longer \[ns\].
     const HEALTH: i64 = 150_000_000;
 
@@ -400,14 +430,49 @@ impl ExportedTimes {
             Topic::RecordedHealth => (&mut self.healths, Self::HEALTH),
             topic => return !topic.recorded() || topic == Topic::RecordedTruth,
         };
-        let around = sensor.saturating_sub(near)..=sensor.saturating_add(near);
-        if times.range(around).next().is_some() {
+        times.add(sensor, near)
+    }
+}
+
+/// The last [`Self::MOST`] times.
+#[derive(Default)]
+struct RecentTimes {
+    /// The times within each second, after its begin \[ns\], by the second.
+    seconds: BTreeMap<i64, Vec<u32>>,
+    count: usize,
+}
+
+impl RecentTimes {
+    /// An hour of poses. A car keeps what it has sent for less, so that nothing comes later.
+    const MOST: usize = 150_000;
+    const SECOND: i64 = 1_000_000_000;
+
+    /// Adds a time \[ns\]. False when there is one within `near` \[ns\] already.
+    fn add(&mut self, time: i64, near: i64) -> bool {
+        let around = time.saturating_sub(near)..=time.saturating_add(near);
+        let [first, last] = [around.start(), around.end()].map(|time| time.div_euclid(Self::SECOND));
+        let mut known = self
+            .seconds
+            .range(first..=last)
+            .flat_map(|(second, times)| times.iter().map(move |time| Self::time(*second, *time)));
+        if known.any(|known| around.contains(&known)) {
             return false;
         }
-        if times.len() == Self::MOST {
-            times.pop_first();
+        if self.count >= Self::MOST
+            && let Some((_, oldest)) = self.seconds.pop_first()
+        {
+            self.count -= oldest.len();
         }
-        times.insert(sensor)
+        let within = time.rem_euclid(Self::SECOND) as u32;
+        let second = time.div_euclid(Self::SECOND);
+        self.seconds.entry(second).or_default().push(within);
+        self.count += 1;
+        true
+    }
+
+    /// The time of which these are the parts. The second alone may be out of range, and then wraps around twice.
+    fn time(second: i64, within: u32) -> i64 {
+        second.wrapping_mul(Self::SECOND).wrapping_add(i64::from(within))
     }
 }
 
@@ -415,6 +480,10 @@ fn begin<W: Write + Seek>(writer: W) -> Result<Writer<W>, mcap::McapError> {
     WriteOptions::new()
         .profile("")
         .library(concat!("pitwall ", env!("CARGO_PKG_VERSION")))
+        // A chunk ends with each sync. Its place in the index stays in memory until the end, so that more chunks cost more.
+        .chunk_size(Some(CHUNK))
+        // The recorder has a thread of its own: threads of the compressor would only cost memory.
+        .compression_threads(0)
         .create(writer)
 }
 
@@ -446,4 +515,83 @@ struct Times {
     arrived: i64,
     published: i64,
     sequence: u32,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+    use std::sync::Arc;
+
+    use protocol::{Header, Schema, Stamps};
+
+    use super::*;
+    use crate::event::Delivery;
+
+    // Each chunk has an entry in the index for every channel, which stays in memory. Twenty cars once ended a chunk every tenth of
+    // a second.
+    #[test]
+    fn a_chunk_ends_with_a_sync_and_not_before() {
+        let mut recording = RecordingWriter::new(Cursor::new(Vec::new())).expect("begun");
+        for number in 1..=80 {
+            let stamps = Stamps {
+                run_id: 1,
+                sequence: number,
+                sensor: number as i64,
+                published: number as i64,
+            };
+            let event = FleetEvent {
+                at: 1,
+                car: "car-1".parse().expect("a name"),
+                payload: EventPayload::Message {
+                    topic: Topic::Pose,
+                    delivery: Delivery::Live,
+                    header: Header::new(Schema::Pose, 1, stamps),
+                    telemetry: Box::new(Telemetry::Pose(foxglove::tests::pose())),
+                    bytes: Arc::from(vec![number as u8; 50_000]),
+                },
+            };
+            recording.write(&event).expect("written");
+            if number == 40 {
+                recording.flush().expect("synced");
+            }
+        }
+        let (_, file) = recording.finish().expect("completed");
+        let summary = mcap::Summary::read(file.get_ref()).expect("whole");
+        assert_eq!(summary.expect("an index").chunk_indexes.len(), 2);
+    }
+
+    const SECOND: i64 = RecentTimes::SECOND;
+
+    #[test]
+    fn full_rate_messages_fill_what_is_missing_of_the_live_ones() {
+        let mut times = ExportedTimes::default();
+        let mut add = |topic, ms: i64| times.add(topic, ms * 1_000_000);
+        assert!(add(Topic::Pose, 1000) && add(Topic::RecordedPose, 1025));
+        assert!(!add(Topic::RecordedPose, 1000) && !add(Topic::Pose, 1025));
+        assert!(add(Topic::Health, 2000));
+        assert!(!add(Topic::RecordedHealth, 2100) && !add(Topic::RecordedHealth, 1900));
+        assert!(add(Topic::RecordedHealth, 2200));
+        assert!(add(Topic::RecordedTruth, 1000) && !add(Topic::RecordedScan, 1000));
+    }
+
+    // The times of a session once took more memory with each hour.
+    #[test]
+    fn an_hour_of_times_is_kept_and_no_more() {
+        let mut times = RecentTimes::default();
+        for tick in 0..3 * 3600 * 40 {
+            assert!(times.add(tick * SECOND / 40, 0));
+        }
+        assert_eq!(times.count, times.seconds.values().map(Vec::len).sum::<usize>());
+        assert!(times.count <= RecentTimes::MOST);
+        let newest = (3 * 3600 * 40 - 1) * SECOND / 40;
+        assert!(!times.add(newest - 3600 * SECOND, 0), "within the hour");
+    }
+
+    #[test]
+    fn times_at_the_ends_of_the_range_are_times() {
+        let mut times = RecentTimes::default();
+        for time in [i64::MIN, i64::MIN + 1, -1, 0, i64::MAX] {
+            assert!(times.add(time, 0) && !times.add(time, 150_000_000), "{time}");
+        }
+    }
 }

@@ -272,7 +272,8 @@ def halls(arguments, count):
         row["routers"] = {name: {"cores": (cpu(process.pid) - busy[name]) / passed, "memory_mb": memory(process.pid)}
                           for name, process in routers.items()}
         row["memory_mb"] = memory(wall.pid)
-        row["poses_per_s"] = sum(car["streams"]["pose"]["rate_hz"] for car in page.last["cars"])
+        rates = [car["streams"].get("pose", {"rate_hz": 0})["rate_hz"] for car in page.last["cars"]]
+        row["poses_per_s"], row["without_poses"] = sum(rates), sum(rate == 0 for rate in rates)
         row["live"] = len(page.lively)
         whole = [car["streams"].get(topic, {"missing": 0})["missing"] for car in page.last["cars"] for topic in ("health", "event")]
         row["missing"] = sum(whole)
@@ -296,7 +297,7 @@ HEAD = ["| cars | sent | pit wall [cores] | and a page | snapshots/s | recorder 
 
 
 def line(row):
-    return (f"| {row['cars']} | {100 * row['share']:.0f} % | {row['wall_cores']:.2f} | +{row['page_cores']:.2f} | {row['snapshots_per_s']:.1f} | {row['recorder_cores']:.2f} "
+    return (f"| {row['cars']} | {100 * row['share']:.0f} % | {row['wall_cores']:.2f} | {row['page_cores']:+.2f} | {row['snapshots_per_s']:.1f} | {row['recorder_cores']:.2f} "
             f"| {row['memory_mb']:.0f} | {row['growth_mb']:+.1f} | {row['missing']} | {row['recorded']} | {row['recorded_missing']} |")
 
 
@@ -353,6 +354,8 @@ def main():
                 f"{hall['memory_mb']:.0f} MB, {hall['snapshots_per_s']:.1f} snapshots/s")
             if hall["live"] != hall["cars"] or hall["missing"]:
                 faults.append(f"two halls: {hall['live']} of {hall['cars']} cars, {hall['missing']} missing")
+            if hall["without_poses"]:
+                faults.append(f"two halls: the centre gets no poses of {hall['without_poses']} cars")
     if arguments.json:
         print(json.dumps({"fleets": rows, "halls": hall, "faults": faults}))
     if arguments.write:

@@ -50,6 +50,9 @@ use crate::{
     TLS_ACCEPT_THROTTLE_TIME, TLS_DEFAULT_MTU, TLS_LINGER_TIMEOUT, TLS_LOCATOR_PREFIX,
 };
 
+/// Before the next attempt to accept a connection, after one that failed.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
 #[derive(Default, Debug, PartialEq, Eq, Hash)]
 pub struct TlsCommonName(String);
 
@@ -467,16 +470,28 @@ async fn accept_task(
         e
     })?;
 
-    let mut listener = tls_listener::builder(acceptor)
+    // Without file handles, accepting pauses. Handshakes under way go on, because their ends give handles back.
+    let accept = || async {
+        loop {
+            match socket.accept().await {
+                Ok(accepted) => return Ok::<_, std::io::Error>(accepted),
+                Err(e) => {
+                    tracing::warn!("{}. Hint: increase the system open file limit.", e);
+                    tokio::time::sleep(ACCEPT_PAUSE).await;
+                }
+            }
+        }
+    };
+    let mut listener = std::pin::pin!(tls_listener::builder(acceptor)
         .handshake_timeout(tls_handshake_timeout)
-        .listen(socket);
+        .listen(tls_listener::accept_generator(accept)));
 
     tracing::trace!("Ready to accept TLS connections on: {:?}", src_addr);
     loop {
         tokio::select! {
             _ = token.cancelled() => break,
 
-            res = listener.accept() => {
+            res = std::future::poll_fn(|cx| listener.as_mut().poll_accept(cx)) => {
                 match res {
                     Ok((tls_stream, dst_addr)) => {
                         let (tcp_stream, tls_conn) = tls_stream.get_ref();

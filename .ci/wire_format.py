@@ -75,7 +75,7 @@ def check_page():
 
     pose = golden_message("pose", wire.POSE, 1)
     check(pose["pose"] == {"x": 1.5, "y": -2.25, "heading": 0.5} and pose["lap"] == 3, "pose as the page explains it")
-    for version, name, causes in [(2, "health", len(wire.CAUSES)), (1, "health of version 1", 20)]:
+    for version, name, causes in [(3, "health", len(wire.CAUSES)), (2, "health of version 2", 42), (1, "health of version 1", 20)]:
         health = golden_message(name, wire.HEALTH, version)
         check(len(health["causes"]) == causes and health["proposal"]["set"] == "lq", f"health of version {version}")
     event = golden_message("event", wire.EVENT, 3)

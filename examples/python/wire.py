@@ -107,7 +107,7 @@ CAUSES = (
     "odometry_jump gyro_in_degrees gyro_flipped gyro_bias gyro_ignored gyro_always_zero odometry_turn_scale "
     "odometry_turn_bias odometry_turn_wrong twist_from_pose pose_from_twist wheel_scale creep wheels_slide "
     "sweep_from_scan_time time_increment_wrong range_max_wrong angle_increment_missing scan_lag repeated_scans "
-    "clock_step map_differs"
+    "clock_step map_differs odometry_stands"
 ).split()
 
 pose2 = record(x=f64, y=f64, heading=f64)
@@ -142,7 +142,7 @@ POSE = Message(
 )  # fmt: skip
 
 HEALTH = Message(
-    "health", 4, {1, 2},
+    "health", 4, {1, 2, 3},
     record(
         state=state,
         since=i64,

@@ -21,12 +21,14 @@ pub enum SensorFinding {
     OdometryTurnWrong,
     /// Odometry's twist is missing, or does not fit its pose; it is derived from the pose. Twist over pose.
     TwistFromPose,
-    /// Odometry's pose does not move, or has no orientation; it is integrated from the twist. Distance by the twist \[m\].
+    /// Odometry's pose does not move, moves in steps, or has no orientation; it is integrated from the twist. Distance by the twist \[m\].
     PoseFromTwist,
     /// Odometry's distance is a fixed multiple of the distance by the scans; it is corrected. That multiple.
     WheelScale,
     /// Odometry moves while the scans stand still; it is held. Its speed [m/s].
     Creep,
+    /// Odometry stands still while the scans move; the car is carried on by the scans. Its speed [m/s].
+    OdometryStands,
     /// The wheels gain or lose speed as no tyre can; the car's own speed is carried on. Wheels less car [m/s].
     WheelsSlide,
     /// The scanner states no `time_increment`; it is taken from `scan_time`. Length of the sweep \[s\].
@@ -43,7 +45,7 @@ pub enum SensorFinding {
 
 impl SensorFinding {
     /// All of them.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::GyroInDegrees,
         Self::GyroFlipped,
         Self::GyroBias,
@@ -56,6 +58,7 @@ impl SensorFinding {
         Self::PoseFromTwist,
         Self::WheelScale,
         Self::Creep,
+        Self::OdometryStands,
         Self::WheelsSlide,
         Self::SweepFromScanTime,
         Self::TimeIncrementWrong,

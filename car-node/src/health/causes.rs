@@ -136,6 +136,7 @@ fn of_sensor(finding: SensorFinding) -> (CauseKind, Severity) {
         SensorFinding::PoseFromTwist => (CauseKind::PoseFromTwist, Info),
         SensorFinding::WheelScale => (CauseKind::WheelScale, Info),
         SensorFinding::Creep => (CauseKind::Creep, Info),
+        SensorFinding::OdometryStands => (CauseKind::OdometryStands, Warning),
         SensorFinding::WheelsSlide => (CauseKind::WheelsSlide, Warning),
         SensorFinding::SweepFromScanTime => (CauseKind::SweepFromScanTime, Info),
         SensorFinding::TimeIncrementWrong => (CauseKind::TimeIncrementWrong, Info),

@@ -7,7 +7,7 @@ use localizer::{Dropped, Odometry, SensorFindings, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::calibration::{Drive, SlipModel};
-use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, WheelGrip};
+use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, STANDS, WheelGrip};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
 /// whoever reads it sees one smooth motion in a frame of its own. Whether a jump was one of the car, which was carried or
@@ -24,6 +24,10 @@ pub(crate) struct OdometryTrack {
     last: Option<Odometry>,
     fields: OdometryFields,
     grip: WheelGrip,
+    /// Messages on end that stood still, but for those in which the wheels braked.
+    silent: u32,
+    /// While odometry is silent: the car's twist by the scans [m/s], [m/s], [rad/s].
+    carried: Option<[f64; 3]>,
     /// What the checks of the sensors have found.
     pub(crate) corrections: Corrections,
     yaw_rates: VecDeque<YawRate>,
@@ -48,8 +52,14 @@ const TWIST_RATE: [f64; 2] = [12.0, 100.0];
 /// After a gap of so long \[s\] the pose says where the car has gone, and not the twist, if it can have gone so far.
 const GAP: f64 = 0.5;
 
-/// Wheels that turn faster than this do not creep [m/s].
-const SLOW: f64 = 0.3;
+/// Wheels that stand for longer while the car moves do not brake it: odometry is silent \[s\].
+const BRAKING: f64 = 1.0;
+
+/// A twist by the scans that differs by more is none: the pose was found elsewhere [m/s], [rad/s].
+const PLAUSIBLE: [f64; 3] = [3.0, 3.0, 5.0];
+
+/// Share of it that is believed.
+const GAIN: f64 = 0.5;
 
 /// A faster turn [rad/s] is none, in whatever unit: in deg/s a turn has up to 57 times its number, which [`crate::sensor_check`]
 /// finds out.
@@ -113,13 +123,21 @@ impl OdometryTrack {
         }
         let received = *odometry;
         let mut odometry = self.fields.completed(odometry);
-        let Some(last) = self.last else {
+        let speaks = odometry.twist.linear_x.abs() >= STANDS;
+        let Some(mut last) = self.last else {
             self.last = Some(odometry);
             self.received.push_back(received);
             self.points.push_back(odometry);
             self.driven.push_back(DrivenSums::default());
             return Ok(());
         };
+        if let Some([linear_x, linear_y, angular]) = self.carried.filter(|_| speaks) {
+            last.twist = Twist {
+                linear_x,
+                linear_y,
+                angular,
+            };
+        }
         let dt = odometry.stamp.since(last.stamp);
         odometry.twist.angular = towards(last.twist.angular, odometry.twist.angular, dt, 1);
         self.last = Some(odometry);
@@ -207,12 +225,26 @@ impl OdometryTrack {
             // The same arc, turned by the gyroscope.
             arc[2] = correction.corrected(reading, dt);
         }
-        let speed = self.grip.speed(odometry.stamp, twist[0]);
+        let stands = linear_x.abs() < STANDS && arc[0].abs() < STANDS * dt.max(1e-3);
+        self.carried = self.carried.filter(|_| stands);
+        let wheels = self.carried.map_or(twist[0], |carried| carried[0]);
+        let speed = self.grip.speed(odometry.stamp, wheels);
         if self.grip.is_sliding() {
             arc[0] = speed * dt;
             twist[0] = speed;
         }
-        if standing && linear_x.abs() < SLOW {
+        let brakes = self.grip.sliding_for().is_some_and(|seconds| seconds < BRAKING);
+        self.silent = if stands && !brakes {
+            self.silent.saturating_add(1)
+        } else {
+            0
+        };
+        if let Some(carried) = self.carried {
+            // A gyroscope knows the turn better.
+            let turn = gyro.and(gyro_correction).map(|_| arc[2]);
+            (arc, twist) = (carried.map(|v| v * dt), carried);
+            arc[2] = turn.unwrap_or(arc[2]);
+        } else if standing && linear_x.abs() < STANDS {
             (arc, twist) = ([0.0; 3], [0.0; 3]);
         }
         (arc, twist)
@@ -226,7 +258,12 @@ impl OdometryTrack {
             turn: sums.turn + turn,
             gyro_turn: sums.gyro_turn + gyro.unwrap_or(0.0),
             gyro_time: sums.gyro_time + gyro.map_or(0.0, |_| dt),
-            sliding: sums.sliding + if self.grip.is_sliding() { dt } else { 0.0 },
+            sliding: sums.sliding
+                + if self.wheels_slide() || self.is_carried() {
+                    dt
+                } else {
+                    0.0
+                },
         });
     }
 
@@ -246,10 +283,35 @@ impl OdometryTrack {
         }
     }
 
-    /// Speed of the car by the last message [m/s]: that of the wheels, unless they slide.
+    /// Speed of the car by the last message [m/s]: that of the wheels, unless they slide or are silent.
     pub(crate) fn speed(&self) -> f64 {
         let wheels = self.last.map_or(0.0, |last| last.twist.linear_x);
-        self.grip.sliding_speed().unwrap_or(wheels)
+        let carried = self.carried.map(|twist| twist[0]);
+        carried.or(self.grip.sliding_speed()).unwrap_or(wheels)
+    }
+
+    /// How many messages on end stood still.
+    pub(crate) fn silent_messages(&self) -> u32 {
+        self.silent
+    }
+
+    /// Odometry stands still and the car moves: from the last message on it is carried on at this twist [m/s], [m/s], [rad/s].
+    pub(crate) fn carry_on(&mut self, twist: [f64; 3]) {
+        self.carried = Some(twist);
+        self.grip.release();
+        if let Some(point) = self.points.back_mut() {
+            let [linear_x, linear_y, angular] = twist;
+            point.twist = Twist {
+                linear_x,
+                linear_y,
+                angular,
+            };
+        }
+    }
+
+    /// Whether the car is carried on at its twist by the scans.
+    pub(crate) fn is_carried(&self) -> bool {
+        self.carried.is_some()
     }
 
     /// Whether the wheels slide, so that the car's own speed is carried on.
@@ -257,9 +319,19 @@ impl OdometryTrack {
         self.grip.is_sliding()
     }
 
-    /// The scans say that the car drives at `speed` [m/s]; `share` of it is to be believed. Counts while the wheels slide.
-    pub(crate) fn correct_speed(&mut self, speed: f64, share: f64) {
-        self.grip.correct(speed, share);
+    /// The scans say that the car moves at `twist` [m/s], [m/s], [rad/s]; `share` of its speed is to be believed, in [0, 1].
+    /// Counts while the wheels slide or are silent.
+    pub(crate) fn correct_twist(&mut self, twist: [f64; 3], share: f64) {
+        self.grip.correct(twist[0], share);
+        if let Some(carried) = &mut self.carried {
+            let shares = [share.clamp(0.0, 1.0), 1.0, 1.0];
+            for i in 0..3 {
+                let off = twist[i] - carried[i];
+                if off.abs() < PLAUSIBLE[i] {
+                    carried[i] += GAIN * shares[i] * off;
+                }
+            }
+        }
     }
 
     /// Adds what is wrong with odometry.

@@ -8,6 +8,7 @@
 //! - [`sweep_check`]: whether a scan without `time_increment` is a sweep.
 //! - [`repeated_scan`]: a scanner that hangs.
 //! - [`standstill`]: odometry that creeps while the scans stand still.
+//! - [`silent_odometry`]: odometry that stands still while the scans move.
 //! - [`odometry_fields`]: odometry without twist, pose or orientation.
 //! - [`wheel_grip`]: wheels that lock or spin.
 //! - [`turn_check`]: unit, sign and bias of yaw rates.
@@ -19,6 +20,8 @@ mod odometry_fields;
 mod repeated_scan;
 mod scan_geometry;
 mod scan_lag;
+mod scan_pair;
+mod silent_odometry;
 mod standstill;
 mod sweep_check;
 mod turn_check;
@@ -34,6 +37,8 @@ pub(crate) use self::odometry_fields::OdometryFields;
 use self::repeated_scan::RepeatedScan;
 pub(crate) use self::scan_geometry::ScanGeometry;
 use self::scan_lag::ScanLag;
+use self::silent_odometry::SilentOdometry;
+pub(crate) use self::silent_odometry::{STANDS, Silence};
 use self::standstill::Standstill;
 pub(crate) use self::sweep_check::SweepCheck;
 pub(crate) use self::turn_check::TurnCorrection;
@@ -52,7 +57,7 @@ pub(crate) struct DrivenSums {
     pub(crate) gyro_turn: f64,
     /// For how long it spoke \[s\].
     pub(crate) gyro_time: f64,
-    /// For how long the wheels slid \[s\].
+    /// For how long the wheels slid, or odometry was silent \[s\].
     pub(crate) sliding: f64,
 }
 
@@ -148,6 +153,7 @@ pub(crate) struct SensorCheck {
     fitted: VecDeque<FittedPose>,
     repeated: RepeatedScan,
     standstill: Standstill,
+    silent: SilentOdometry,
     gyro: GyroCheck,
     turn: OdometryTurnCheck,
     scale: WheelScale,
@@ -180,10 +186,29 @@ impl SensorCheck {
             .stands(scan, geometry, base_link_from_laser, driven, speed)
     }
 
+    /// Whether odometry, of which `silent` messages on end stood still, has just been found to do so while the car moves.
+    pub(crate) fn silence(
+        &mut self,
+        scan: &Scan,
+        geometry: &ScanGeometry,
+        base_link_from_laser: Pose,
+        driven: &DrivenSums,
+        silent: u32,
+    ) -> Option<Silence> {
+        self.silent
+            .compare(scan, geometry, base_link_from_laser, driven, silent)
+    }
+
     /// The pose has been set or lost: what was fitted before is no reference.
     pub(crate) fn forget_pose(&mut self) {
         self.fitted.clear();
+        self.silent.forget_pose();
         self.sweep.forget_pose();
+    }
+
+    /// Takes in the same pose for the check of silent odometry; see there.
+    pub(crate) fn note_pose(&mut self, pose: Pose, seconds: f64, information: f64) {
+        self.silent.note_pose(pose, seconds, information);
     }
 
     /// Takes in a pose that a scan was fitted to. `driven` gives the sums at a stamp, `latest` is odometry's latest. Returns true
@@ -237,9 +262,11 @@ impl SensorCheck {
                         driven,
                     };
                     self.gyro.learn(&stretch);
-                    self.turn.learn(&stretch);
-                    rescaled |= self.scale.learn(&stretch, corrections.wheel_scale);
                     self.lag.learn(seconds, turn, between);
+                    if driven.sliding <= 0.0 {
+                        self.turn.learn(&stretch);
+                        rescaled |= self.scale.learn(&stretch, corrections.wheel_scale);
+                    }
                 }
             }
             self.fitted.drain(..end);
@@ -258,8 +285,8 @@ impl SensorCheck {
             .position(|fitted| fitted.stamp.since(from) >= STRETCH)
     }
 
-    /// Adds what has been found.
-    pub(crate) fn report(&self, findings: &mut SensorFindings) {
+    /// Adds what has been found; the car drives at `speed` [m/s].
+    pub(crate) fn report(&self, speed: f64, findings: &mut SensorFindings) {
         for (finding, value) in self.header.iter() {
             findings.insert(finding, value);
         }
@@ -267,6 +294,7 @@ impl SensorCheck {
         self.turn.report(findings);
         self.scale.report(findings);
         self.standstill.report(findings);
+        self.silent.report(speed, findings);
         if self.lag.lag() != 0.0 {
             findings.insert(SensorFinding::ScanLag, self.lag.lag());
         }

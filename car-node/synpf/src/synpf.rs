@@ -27,7 +27,7 @@ use crate::particle_filter::{ParticleFilter, Weighted};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
 use crate::recovery::{Decision, Evidence, Recovery};
-use crate::sensor_check::SensorCheck;
+use crate::sensor_check::{SensorCheck, Silence};
 use crate::track_map::TrackMap;
 use crate::tracker::{Tracker, Uncertainty};
 use crate::tuning::Tuning;
@@ -68,6 +68,8 @@ struct Step {
     twist: Twist,
     /// Motion of `base_link` since the estimate, without odometry's discontinuities.
     motion: Pose,
+    /// Odometry has just been found to stand still while the car moves: the motion is that by the scans.
+    silence: Option<Silence>,
     /// Where the estimate would be carried with them; None without any.
     displaced: Option<Pose>,
     /// See [`Update::odometry_jump`].
@@ -134,7 +136,11 @@ impl SynPf {
         let weighted = self.reweight(&predicted);
         let correction = self.fit(&step, &predicted, weighted.as_ref());
         let quality = self.assess();
-        let quality = self.recover(&step, correction, quality);
+        let mut quality = self.recover(&step, correction, quality);
+        if step.silence.is_some_and(|silence| silence.lost) && self.mode == Mode::Tracking {
+            self.relocalize();
+            quality = self.assess();
+        }
         self.resample(weighted.as_ref());
         Ok(self.update(&step, &predicted, weighted.as_ref(), &quality))
     }
@@ -152,6 +158,7 @@ impl SynPf {
         // By odometry's clock.
         let stamp = scan.stamp.plus(-geometry.lag);
         let (odom, twist) = self.odometry.at(stamp, CARRY).ok_or(Dropped::NoOdometry)?;
+        let silence = self.check_silence(scan, &geometry);
         self.load_scan(scan, &geometry)?;
         self.last_scan = Some(scan.stamp);
         let (before, odom_before) = self.tracker.at.unwrap_or((scan.stamp, odom));
@@ -170,7 +177,11 @@ impl SynPf {
             sweep: geometry.time_increment * scan.ranges.len() as f64,
             odom,
             twist,
-            motion: odom.since(odom_before),
+            motion: silence.and_then(|silence| silence.pose).map_or_else(
+                || odom.since(odom_before),
+                |pose| pose.since(self.tracker.estimate.pose),
+            ),
+            silence,
             displaced: discontinuity.map(|by| self.tracker.estimate.pose * (by * odom).since(odom_before)),
             odometry_jump: discontinuity.map(|by| [odom.distance(by * odom), wrap_angle(by.heading).abs()]),
         })
@@ -182,9 +193,14 @@ impl SynPf {
         let parameters = &self.parameters;
         let calibration = &mut self.calibration;
         let factor = noise_factor(seconds, calibration, parameters.motion.adaptive);
-        let slides = calibration.slip_model.spinning() || self.odometry.wheels_slide();
+        let slides =
+            calibration.slip_model.spinning() || self.odometry.wheels_slide() || step.silence.is_some();
         let sliding = slides.then(|| calibration.speed());
-        let uncertainty = Uncertainty { factor, sliding };
+        let uncertainty = Uncertainty {
+            factor,
+            sliding,
+            carried: self.odometry.is_carried(),
+        };
         let mut predicted = self
             .tracker
             .predict(motion, seconds, uncertainty, &parameters.motion);
@@ -253,7 +269,12 @@ impl SynPf {
         if !fit.held {
             self.tracker.gate.learn_fit(fit.on_walls, step.motion.x);
         }
-        if learns_slip(parameters) && fit.from_prediction && !fit.held && !self.odometry.wheels_slide() {
+        if learns_slip(parameters)
+            && fit.from_prediction
+            && !fit.held
+            && !self.odometry.wheels_slide()
+            && !self.odometry.is_carried()
+        {
             calibration.slip_model.learn(predicted, &estimate);
         } else {
             calibration.slip_model.forget_pose();

@@ -92,6 +92,8 @@ pub(crate) struct Uncertainty {
     pub(crate) factor: f64,
     /// While wheels spin or lock: the car's speed before [m/s]. Wheels that lock stand still, and the car slides on.
     pub(crate) sliding: Option<f64>,
+    /// Odometry is silent, and the car is carried on at the twist of the scan before.
+    pub(crate) carried: bool,
 }
 
 /// For so long odometry errs by the same share \[s\]: a bend, a braking.
@@ -105,6 +107,14 @@ const SHORTEST: f64 = 1e-3;
 
 /// How far the speed of wheels that spin or lock may be off, as a share of it.
 const SPINNING_SPEED_ERROR: f64 = 0.6;
+
+/// What a twist that is carried on misses: acceleration [m/s^2], [rad/s^2], and what was wrong with it [m/s], [rad/s]. A coefficient
+/// of friction of 1; a car that turns in.
+const CARRIED_ACCELERATION: [f64; 2] = [10.0, 30.0];
+const CARRIED_ERROR: [f64; 2] = [0.2, 0.3];
+
+/// Where the scans do not tell a speed that is carried on, it errs as one of at least this [m/s].
+const CARRIED_SPEED: f64 = 1.0;
 
 /// By how much more odometry may err while tyres are near their limit, for what corrections may add up to.
 const SLIDING_FACTOR: f64 = 3.0;
@@ -354,7 +364,17 @@ fn steady_noise(
     });
     let steady_xy = p.diffusion_xy.powi(2) * seconds;
     let steady_heading = p.diffusion_heading.powi(2) * seconds;
-    Matrix3::from_diagonal(&Vector3::new(steady_xy + along, steady_xy, steady_heading))
+    let carried = if uncertainty.carried {
+        [0, 1].map(|i| (0.5 * CARRIED_ACCELERATION[i] * seconds + CARRIED_ERROR[i]) * seconds)
+    } else {
+        [0.0; 2]
+    };
+    let [carried_xy, carried_heading] = carried.map(|error| error * error);
+    Matrix3::from_diagonal(&Vector3::new(
+        steady_xy + along + carried_xy,
+        steady_xy + carried_xy,
+        steady_heading + carried_heading,
+    ))
 }
 
 /// How odometry's present error moves the pose.
@@ -373,12 +393,15 @@ impl Drift {
     /// `odometry_*_error` in each such time anew, whatever the laser's rate.
     fn new(motion: Pose, seconds: f64, uncertainty: Uncertainty, parameters: &MotionParameters) -> Self {
         let p = parameters;
-        let shares = Vector3::new(
-            p.odometry_speed_error,
-            p.odometry_side_error,
-            p.odometry_yaw_error,
-        ) * (uncertainty.factor * std::f64::consts::FRAC_1_SQRT_2);
-        let distance = motion.x.hypot(motion.y);
+        let mut distance = motion.x.hypot(motion.y);
+        let mut speed_error = p.odometry_speed_error;
+        if uncertainty.carried {
+            // Between walls that look the same everywhere the speed is what it was before them.
+            speed_error = speed_error.max(SPINNING_SPEED_ERROR);
+            distance = distance.max(CARRIED_SPEED * seconds);
+        }
+        let shares = Vector3::new(speed_error, p.odometry_side_error, p.odometry_yaw_error)
+            * (uncertainty.factor * std::f64::consts::FRAC_1_SQRT_2);
         Self {
             by: Matrix3::from_diagonal(&Vector3::new(
                 distance.copysign(motion.x),
@@ -431,6 +454,7 @@ mod tests {
     const GRIPPING: Uncertainty = Uncertainty {
         factor: 1.0,
         sliding: None,
+        carried: false,
     };
 
     /// As white noise in each scan's interval, a laser at 10 Hz had twice the standard deviations of one at 40 Hz.
@@ -439,6 +463,7 @@ mod tests {
         let sliding = Uncertainty {
             factor: 2.0,
             sliding: Some(5.0),
+            carried: false,
         };
         for uncertainty in [GRIPPING, sliding] {
             let usual = after_drive(80, uncertainty);

@@ -225,6 +225,87 @@ fn wheels_that_lock_on_a_car_that_rolls_on_do_not_stop_the_pose() {
     assert!(!held);
 }
 
+/// Never LOCALIZED, and leaps of 12 m: the pose stood with odometry, and each scan asked for another place.
+#[test]
+fn odometry_that_stands_still_does_not_stop_the_pose() {
+    let stands = |from: f64, to: f64| {
+        wheels(move |t, message| {
+            if (from..to).contains(&t) {
+                *message = Odometry {
+                    stamp: message.stamp,
+                    pose: if from > 0.0 {
+                        odometry(from, 1.0).pose
+                    } else {
+                        Pose::IDENTITY
+                    },
+                    twist: Twist::default(),
+                };
+            }
+        })
+    };
+    // From the start, and with a gyroscope that knows the turn.
+    let all_along = stands(0.0, f64::INFINITY);
+    let with_gyro = Sensors {
+        gyro: Some(Box::new(|rate| rate)),
+        ..stands(0.0, f64::INFINITY)
+    };
+    for sensors in [&all_along, &with_gyro] {
+        let outcomes = drive(sensors, lap());
+        assert!(worst(&outcomes) < 0.05, "{}", worst(&outcomes));
+        let speed = found(&outcomes, SensorFinding::OdometryStands).expect("found");
+        let driven = odometry(lap(), 1.0).twist.linear_x;
+        assert!((speed - driven).abs() < 0.3, "{speed} {driven}");
+        assert!(found(&outcomes, SensorFinding::OdometryTurnWrong).is_none());
+        let (_, last) = updates(&outcomes).last().expect("updates");
+        assert!((last.twist.linear_x - driven).abs() < 0.3, "{:?}", last.twist);
+    }
+    // A cable that has a loose contact.
+    let outcomes = drive(&stands(3.0, 6.0), 8.0);
+    assert!(worst(&outcomes) < 0.05, "{}", worst(&outcomes));
+    assert!(
+        found(&outcomes, SensorFinding::OdometryStands).is_none(),
+        "it is back"
+    );
+}
+
+/// The last message again and again, with new stamps: the pose drove on at its speed.
+#[test]
+fn a_driver_that_hangs_does_not_move_the_pose() {
+    let outcomes = drive(
+        &wheels(|t, message| {
+            if t > 2.5 {
+                *message = Odometry {
+                    stamp: message.stamp,
+                    ..odometry(2.5, 1.0)
+                };
+            }
+        }),
+        lap(),
+    );
+    // Three messages tell that it hangs: 0.28 m.
+    assert!(worst(&outcomes) < 0.28, "{}", worst(&outcomes));
+    let late = updates(&outcomes).filter(|(t, _)| *t > 3.0);
+    assert!(
+        late.fold(0.0, |worst: f64, (t, update)| worst
+            .max(update.pose.distance(truth(t))))
+            < 0.03
+    );
+    assert!(found(&outcomes, SensorFinding::OdometryStands).is_some());
+}
+
+#[test]
+fn a_position_in_steps_is_smoothed_by_the_twist() {
+    let coarse = |v: f64| (v / 0.2).round() * 0.2;
+    let outcomes = drive(
+        &wheels(move |_, message| {
+            (message.pose.x, message.pose.y) = (coarse(message.pose.x), coarse(message.pose.y));
+        }),
+        lap(),
+    );
+    assert!(worst(&outcomes) < 0.05, "{}", worst(&outcomes));
+    assert!(found(&outcomes, SensorFinding::PoseFromTwist).is_some());
+}
+
 /// Patches of 2 m in which the barrier is a net, and the laser sees spectators half a metre behind it: the pose leapt to where
 /// they stood on walls.
 #[test]

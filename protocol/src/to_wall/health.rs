@@ -142,7 +142,7 @@ pub enum CauseKind {
     OdometryTurnWrong,
     /// Odometry's twist is missing or wrong and derived from its pose.
     TwistFromPose,
-    /// Odometry's pose is missing and integrated from its twist.
+    /// Odometry's pose is missing or coarse and integrated from its twist.
     PoseFromTwist,
     /// Odometry's distance is off by a factor and corrected.
     WheelScale,
@@ -166,6 +166,8 @@ pub enum CauseKind {
     ClockStep,
     /// On several passes the laser has seen walls elsewhere than the map draws them; over this length.
     MapDiffers,
+    /// Odometry stands still while the scans move; the car is carried on by the scans.
+    OdometryStands,
 }
 
 impl CauseKind {
@@ -202,7 +204,7 @@ impl CauseKind {
             Self::OdometryTurnBias => "odometry's yaw rate has a bias, taken out",
             Self::OdometryTurnWrong => "odometry's turn fits the scans neither way: share explained",
             Self::TwistFromPose => "odometry's twist is zero or wrong, taken from its pose: times",
-            Self::PoseFromTwist => "odometry's pose is missing, taken from its twist after",
+            Self::PoseFromTwist => "odometry's pose is missing or coarse, taken from its twist after",
             Self::WheelScale => "odometry's distance scaled, corrected: times",
             Self::Creep => "odometry creeps at standstill, held",
             Self::WheelsSlide => "wheels lock or spin, off by",
@@ -214,12 +216,14 @@ impl CauseKind {
             Self::RepeatedScans => "scans repeat: scanner hangs, for",
             Self::ClockStep => "sensors' clock was set, followed: by",
             Self::MapDiffers => "the map differs from what the laser sees, over",
+            Self::OdometryStands => "odometry stands still, carried on by the scans: car at",
         }
     }
 
     /// Whether it names a fault of a sensor that the car has found and works around.
     pub fn is_sensor_fault(self) -> bool {
         self as u32 >= Self::GyroInDegrees as u32 && self as u32 <= Self::RepeatedScans as u32
+            || self == Self::OdometryStands
     }
 
     /// The unit of its value.
@@ -234,7 +238,7 @@ impl CauseKind {
             | Self::RangeMaxWrong
             | Self::MapDiffers => "m",
             Self::YawRate | Self::GyroBias | Self::OdometryTurnBias => "rad/s",
-            Self::Creep | Self::WheelsSlide => "m/s",
+            Self::Creep | Self::WheelsSlide | Self::OdometryStands => "m/s",
             Self::AngleIncrementMissing => "rad",
             Self::Age
             | Self::NoScan
@@ -331,11 +335,11 @@ impl Message for Health {
     const SCHEMA: Schema = Schema::Health;
     const MAX_LEN: usize = 4096;
 
-    /// Version 2 added a cause.
-    const VERSION: u16 = 2;
+    /// Versions 2 and 3 added causes.
+    const VERSION: u16 = 3;
 
     fn older(version: u16, payload: &Payload<'_>) -> Option<Result<Self, CodecError>> {
-        (version == 1).then(|| payload.read())
+        (1..=2).contains(&version).then(|| payload.read())
     }
 
     fn validate(&self) -> Result<(), Invalid> {

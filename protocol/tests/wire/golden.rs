@@ -125,6 +125,18 @@ fn older<M: Message>(version: u16, payload: &str) -> M {
 }
 
 #[test]
+fn health_of_version_2_is_read() {
+    let mut expected = samples::health(State::Degraded);
+    let last = expected.causes.pop().map(|cause| cause.kind);
+    assert_eq!(
+        last,
+        Some(CauseKind::OdometryStands),
+        "version 2 knows all but this"
+    );
+    assert_eq!(older::<Health>(2, golden("health of version 2")), expected);
+}
+
+#[test]
 fn health_of_version_1_is_read() {
     let mut expected = samples::health(State::Degraded);
     // The causes of sensors came later.

@@ -24,7 +24,7 @@ const RATES: Rates = Rates {
 };
 pub(crate) const ID: CommandId = CommandId(0x0102_0304_0506_0708_090a_0b0c_0d0e_0f10);
 
-pub(crate) const CAUSE_KINDS: [CauseKind; 42] = [
+pub(crate) const CAUSE_KINDS: [CauseKind; 43] = [
     CauseKind::NoInitialPose,
     CauseKind::NewPose,
     CauseKind::Alignment,
@@ -67,6 +67,7 @@ pub(crate) const CAUSE_KINDS: [CauseKind; 42] = [
     CauseKind::RepeatedScans,
     CauseKind::ClockStep,
     CauseKind::MapDiffers,
+    CauseKind::OdometryStands,
 ];
 
 pub(crate) const STATES: [State; 7] = [

@@ -1,4 +1,5 @@
-//! Odometry of which one half is missing: a twist of zeros beside a pose that moves, or a pose of zeros beside a twist.
+//! Odometry of which one half is missing or coarse: a twist of zeros beside a pose that moves, a pose of zeros or in steps beside a
+//! twist; and messages that repeat the last one, from a driver that hangs.
 
 use std::collections::VecDeque;
 
@@ -23,6 +24,15 @@ pub(crate) struct OdometryFields {
     wrong_twist: Option<f64>,
     /// Some twist was not zero.
     twist_seen: bool,
+    /// Distance by the twist, the older stretches forgotten, and how much of it while the position stood still \[m\].
+    twist_distance: f64,
+    twist_distance_standing: f64,
+    /// The position moves in steps of several messages.
+    coarse: bool,
+    /// Messages on end that repeat one.
+    repeats: u32,
+    /// The twist of that one was new.
+    fresh: bool,
     /// Recent poses.
     poses: VecDeque<(Stamp, Pose)>,
 }
@@ -30,6 +40,12 @@ pub(crate) struct OdometryFields {
 /// A pose that stands still while the twist goes so far is missing [m]: at the origin, where a publisher that never sets it
 /// leaves it, and elsewhere, where it may be coarse.
 const STILL: [f64; 2] = [0.05, 0.6];
+
+/// A position is coarse when it stands still on more than the second share of the way by the twist, and fine below the first.
+const COARSE: [f64; 2] = [0.1, 0.3];
+
+/// So many messages on end that repeat a measured twist and pose are none.
+const REPEATS: u32 = 3;
 
 /// How far the pose must go to judge the twist \[m\].
 const MOVED: f64 = 0.2;
@@ -77,13 +93,20 @@ impl OdometryFields {
         self.twist_seen |= linear_x != 0.0 || linear_y != 0.0 || angular != 0.0;
         let by_twist = mean[0].hypot(mean[1]) * dt.min(GAP);
         let same = |a: f64, b: f64| (a - b).abs() <= 0.0;
-        let stood = same(message.pose.x, last.pose.x)
-            && same(message.pose.y, last.pose.y)
-            && same(message.pose.heading, last.pose.heading);
+        let position_stood = same(message.pose.x, last.pose.x) && same(message.pose.y, last.pose.y);
+        let stood = position_stood && same(message.pose.heading, last.pose.heading);
+        let origin = message.pose.x == 0.0 && message.pose.y == 0.0;
+        if self.hangs(stood && !origin, message.twist == last.twist && by_twist > 0.0) {
+            return Odometry {
+                pose: self.pose,
+                twist: Twist::default(),
+                ..received
+            };
+        }
+        self.judge_position(position_stood, by_twist);
         let oriented = message.pose.heading.is_finite() && last.pose.heading.is_finite();
         if stood || !oriented {
             self.still += by_twist;
-            let origin = message.pose.x == 0.0 && message.pose.y == 0.0;
             self.no_pose |= !oriented || self.still > STILL[usize::from(!origin)];
         } else {
             self.no_pose = false;
@@ -97,10 +120,18 @@ impl OdometryFields {
                 ..received
             };
         }
-        self.pose = message.pose;
         let step = message.pose.since(last.pose);
+        self.pose = if self.coarse {
+            // The way by the twist, the turn by the heading.
+            self.pose * Pose::exp([mean[0] * dt.min(GAP), mean[1] * dt.min(GAP), step.heading])
+        } else {
+            message.pose
+        };
         let distance = step.x.hypot(step.y);
-        if distance < FASTEST * dt && dt < GAP {
+        if self.coarse {
+            // Its steps say little of the way.
+            (self.by_pose, self.by_twist, self.wrong_twist) = (0.0, 0.0, None);
+        } else if distance < FASTEST * dt && dt < GAP {
             self.judge_twist(distance * step.x.signum(), mean[0] * dt);
         }
         self.poses.push_back((message.stamp, message.pose));
@@ -112,7 +143,10 @@ impl OdometryFields {
             self.poses.pop_front();
         }
         if self.wrong_twist.is_none() {
-            return received;
+            return Odometry {
+                pose: self.pose,
+                ..received
+            };
         }
         let (then, before) = self.poses[0];
         let seconds = message.stamp.since(then);
@@ -130,6 +164,29 @@ impl OdometryFields {
                 angular,
             },
             ..received
+        }
+    }
+
+    /// Whether a message repeats the last one because its driver hangs; `pose` and `twist`: these are the same as before. A twist
+    /// that is the same while the pose moves is commanded and not measured: then it may well repeat.
+    fn hangs(&mut self, pose: bool, twist: bool) -> bool {
+        if pose && twist {
+            self.repeats += u32::from(self.fresh);
+        } else {
+            (self.repeats, self.fresh) = (0, !twist);
+        }
+        self.repeats >= REPEATS
+    }
+
+    /// Judges whether the position is coarse, by one step in which the car went so far by the twist \[m\].
+    fn judge_position(&mut self, stood: bool, by_twist: f64) {
+        let keep = (-by_twist / MEMORY).exp();
+        self.twist_distance = self.twist_distance * keep + by_twist;
+        self.twist_distance_standing =
+            self.twist_distance_standing * keep + if stood { by_twist } else { 0.0 };
+        if self.twist_distance > 0.5 * MEMORY {
+            let limit = COARSE[usize::from(!self.coarse)];
+            self.coarse = self.twist_distance_standing > limit * self.twist_distance;
         }
     }
 
@@ -153,8 +210,11 @@ impl OdometryFields {
         if let Some(ratio) = self.wrong_twist {
             findings.insert(SensorFinding::TwistFromPose, ratio);
         }
-        if self.no_pose {
-            findings.insert(SensorFinding::PoseFromTwist, self.still);
+        if self.no_pose || self.coarse {
+            findings.insert(
+                SensorFinding::PoseFromTwist,
+                self.still.max(self.twist_distance_standing),
+            );
         }
     }
 }
@@ -229,13 +289,69 @@ mod tests {
         }
     }
 
+    /// Scans between two steps of the position were up to 20 cm off.
     #[test]
-    fn a_coarse_pose_is_a_pose() {
-        let (_, _, fields) = circle(|message| {
+    fn a_coarse_position_is_integrated_from_the_twist() {
+        let coarse = |message: &mut Odometry| {
             message.pose.x = (message.pose.x / 0.2).round() * 0.2;
             message.pose.y = (message.pose.y / 0.2).round() * 0.2;
+        };
+        let (mut fields, mut steps) = (OdometryFields::default(), Vec::new());
+        let twist = Twist {
+            linear_x: 4.0,
+            linear_y: 0.0,
+            angular: 2.0,
+        };
+        let mut last: Option<Odometry> = None;
+        for i in 0..=100 {
+            let mut message = Odometry {
+                stamp: Stamp(i * 20_000_000),
+                pose: Pose::exp([0.08 * i as f64, 0.0, 0.04 * i as f64]),
+                twist,
+            };
+            coarse(&mut message);
+            let completed = fields.completed(&message);
+            steps.extend(last.map(|last| completed.pose.since(last.pose)));
+            last = Some(completed);
+        }
+        assert!(!fields.no_pose && fields.coarse);
+        for step in &steps[40..] {
+            assert!(
+                (step.x - 0.08).abs() < 2e-3 && (step.heading - 0.04).abs() < 1e-9,
+                "{step:?}"
+            );
+        }
+        // Without a twist the pose is all there is.
+        let (_, _, fields) = circle(|message| {
+            coarse(message);
+            message.twist = Twist::default();
         });
+        assert!(!fields.no_pose && !fields.coarse);
+    }
+
+    #[test]
+    fn a_driver_that_hangs_says_nothing() {
+        let mut fields = OdometryFields::default();
+        let measured = |i: i64| Odometry {
+            stamp: Stamp(i * 20_000_000),
+            pose: Pose::new(1.0 + 0.08 * i as f64, 0.0, 0.0),
+            twist: Twist {
+                linear_x: 4.0 + 1e-3 * i as f64,
+                ..Twist::default()
+            },
+        };
+        let mut passed = measured(0);
+        for i in 0..100 {
+            passed = fields.completed(&Odometry {
+                stamp: measured(i).stamp,
+                ..measured(i.min(50))
+            });
+        }
+        assert_eq!((passed.pose, passed.twist), (measured(50).pose, Twist::default()));
         assert!(!fields.no_pose);
+        // It goes on.
+        let next = measured(120);
+        assert_eq!(fields.completed(&next), next);
     }
 
     #[test]

@@ -82,8 +82,7 @@ impl WheelGrip {
             })
         });
         if caught {
-            self.sliding = None;
-            self.speeds.clear();
+            self.release();
         }
         self.speeds.push_back((stamp, wheels));
         let Some(sliding) = &mut self.sliding else {
@@ -97,8 +96,7 @@ impl WheelGrip {
         let same = (wheels - car).abs() < SAME[0] * car.abs() + SAME[1];
         sliding.gripping = if same { sliding.gripping + 1 } else { 0 };
         if sliding.gripping >= GRIPPING || stamp.since(sliding.since) > LONGEST {
-            self.sliding = None;
-            self.speeds.clear();
+            self.release();
         }
         car
     }
@@ -106,6 +104,17 @@ impl WheelGrip {
     /// Whether the wheels slide.
     pub(crate) fn is_sliding(&self) -> bool {
         self.sliding.is_some()
+    }
+
+    /// For how long the wheels have slid \[s\]; None while they grip.
+    pub(crate) fn sliding_for(&self) -> Option<f64> {
+        self.sliding.map(|sliding| sliding.at.since(sliding.since))
+    }
+
+    /// Ends a slide: the wheels say nothing of the car any more.
+    pub(crate) fn release(&mut self) {
+        self.sliding = None;
+        self.speeds.clear();
     }
 
     /// The car's speed while the wheels slide [m/s].

@@ -53,10 +53,7 @@ impl WheelScale {
     pub(super) fn learn(&mut self, stretch: &Stretch, applied: f64) -> bool {
         let wheels = stretch.driven.distance * applied;
         // Where the scans do not tell the distance, it is the wheels' own.
-        if stretch.driven.sliding > 0.0
-            || wheels.abs() < WALKING * stretch.seconds
-            || stretch.information < 0.02
-        {
+        if wheels.abs() < WALKING * stretch.seconds || stretch.information < 0.02 {
             return false;
         }
         let ratio = stretch.distance / wheels;

@@ -9,7 +9,7 @@ use super::{Step, SynPf};
 use crate::calibration::SlipModel;
 use crate::estimate::Estimate;
 use crate::scan_matcher::{fit, match_scan};
-use crate::sensor_check::{ScanGeometry, SweepCheck};
+use crate::sensor_check::{ScanGeometry, Silence, SweepCheck};
 use crate::{Dropped, Mode};
 
 /// End points by which both readings of a sweep are compared.
@@ -19,7 +19,7 @@ const COMPARED: usize = 180;
 const COMPARED_PRIOR: [f64; 3] = [0.04, 0.04, 0.01];
 
 impl SynPf {
-    /// Refuses a scan that repeats an earlier one, reads its geometry, and notes whether the car stands.
+    /// Refuses a scan that repeats an earlier one, and reads its geometry.
     pub(super) fn check_scan(&mut self, scan: &Scan) -> Result<ScanGeometry, Dropped> {
         let driven = self.odometry.driven_sums();
         if self.sensors.repeats(scan, &driven) {
@@ -30,7 +30,16 @@ impl SynPf {
         Ok(geometry)
     }
 
-    /// Loads the scan, also as the sweep that it may be.
+    /// Notes whether the car moves though odometry stands. Returns what is known of it when that has just been found.
+    pub(super) fn check_silence(&mut self, scan: &Scan, geometry: &ScanGeometry) -> Option<Silence> {
+        let (driven, silent) = (self.odometry.driven_sums(), self.odometry.silent_messages());
+        let laser = self.base_link_from_laser;
+        let silence = self.sensors.silence(scan, geometry, laser, &driven, silent)?;
+        self.odometry.carry_on(silence.twist);
+        Some(silence)
+    }
+
+    /// Loads the scan, also as the sweep that it may be, and notes whether the car stands.
     pub(super) fn load_scan(&mut self, scan: &Scan, geometry: &ScanGeometry) -> Result<(), Dropped> {
         let (slip, laser) = (self.calibration.slip, self.base_link_from_laser);
         let (max_range, beams) = (self.parameters.sensor.max_range, &self.parameters.beams);
@@ -68,8 +77,11 @@ impl SynPf {
         let along = |of: &Estimate| (ahead.transpose() * of.covariance * ahead)[0];
         let information = 1.0 - along(&estimate) / along(predicted).max(1e-12);
         if step.seconds > 0.0 {
-            self.odometry.correct_speed(moved.x / step.seconds, information);
+            let twist = moved.log().map(|v| v / step.seconds);
+            self.odometry.correct_twist(twist, information);
         }
+        let told = 1.0 / along(&estimate).max(1e-12) - 1.0 / along(predicted).max(1e-12);
+        self.sensors.note_pose(estimate.pose, step.seconds, told);
         self.compare_sweep(predicted);
         let Some(latest) = self.odometry.latest() else {
             return;
@@ -135,7 +147,7 @@ impl SynPf {
     /// What is wrong with the sensors.
     pub(super) fn sensor_findings(&self) -> SensorFindings {
         let mut findings = SensorFindings::default();
-        self.sensors.report(&mut findings);
+        self.sensors.report(self.odometry.speed(), &mut findings);
         self.odometry.report(&mut findings);
         findings
     }

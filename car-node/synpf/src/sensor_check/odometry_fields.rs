@@ -29,10 +29,8 @@ pub(crate) struct OdometryFields {
     twist_distance_standing: f64,
     /// The position moves in steps of several messages.
     coarse: bool,
-    /// Messages on end that repeat one.
-    repeats: u32,
-    /// The twist of that one was new.
-    fresh: bool,
+    /// Messages on end that repeat one; None if the twist of that one was not new.
+    repeats: Option<u32>,
     /// Recent poses.
     poses: VecDeque<(Stamp, Pose)>,
 }
@@ -170,12 +168,12 @@ impl OdometryFields {
     /// Whether a message repeats the last one because its driver hangs; `pose` and `twist`: these are the same as before. A twist
     /// that is the same while the pose moves is commanded and not measured: then it may well repeat.
     fn hangs(&mut self, pose: bool, twist: bool) -> bool {
-        if pose && twist {
-            self.repeats += u32::from(self.fresh);
+        self.repeats = if pose && twist {
+            self.repeats.map(|repeats| repeats.saturating_add(1))
         } else {
-            (self.repeats, self.fresh) = (0, !twist);
-        }
-        self.repeats >= REPEATS
+            (!twist).then_some(0)
+        };
+        self.repeats.is_some_and(|repeats| repeats >= REPEATS)
     }
 
     /// Judges whether the position is coarse, by one step in which the car went so far by the twist \[m\].

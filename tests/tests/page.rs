@@ -165,6 +165,13 @@ async fn three_cars_are_shown_switched_relocated_and_lost() {
                 false,
                 "an element overflows at {width}x{height}"
             );
+            // Three cars once needed a scroll bar.
+            let below = "[...document.querySelectorAll('.card')].some((card) => card.getBoundingClientRect().bottom > innerHeight)";
+            assert_eq!(
+                ana.evaluate(below).await,
+                false,
+                "a card is out of sight at {width}x{height}"
+            );
             ana.screenshot(&format!("page-{theme}-{width}x{height}")).await;
         }
         ana.key("t").await;
@@ -452,6 +459,11 @@ async fn refusals_timeouts_candidates_and_markers_are_shown() {
             "document.querySelector('#large .headline')?.innerText.includes('LOCALIZED')",
         )
         .await;
+    // Numbers once overlapped in a wide window.
+    browser.resize(1920, 1080).await;
+    let overlaps = "[...document.querySelectorAll('#large .big b')].some((value) => value.getBoundingClientRect().right > value.parentElement.getBoundingClientRect().right + 1)";
+    assert_eq!(browser.evaluate(overlaps).await, false, "numbers overlap");
+    browser.resize(1366, 768).await;
     browser.screenshot("page-large").await;
     browser
         .evaluate("((list) => { list.value = 'mute'; list.dispatchEvent(new Event('change')); })(document.querySelector('#large select'))")

@@ -42,6 +42,8 @@ pub struct Car {
     pub run_sheet: Option<(Arc<str>, Arc<str>)>,
     /// True when the log has an entry that health messages no longer come, until they do.
     pub(crate) stale_logged: bool,
+    /// When it was last back after it had been BLIND \[unix ns\].
+    pub(crate) back_at: i64,
     /// When a message of a second sender of this name was last dropped \[unix ns\].
     pub(crate) two_senders: Option<i64>,
     /// The newest pose.
@@ -105,6 +107,7 @@ impl Car {
             dismissed: false,
             run_sheet: None,
             stale_logged: false,
+            back_at: i64::MIN,
             two_senders: None,
             pose: None,
             cloud: None,
@@ -437,7 +440,8 @@ impl Car {
     /// first.
     pub fn stale_for(&self, now: i64) -> Option<i64> {
         let stream = self.streams.get(&Topic::Health)?;
-        let silent = now - stream.last_arrival()?;
+        // After a cut, the first health message comes a little later than the first of all.
+        let silent = now - stream.last_arrival()?.max(self.back_at);
         let usual = stream
             .interval()
             .map_or(0, |interval| (3e9 * interval.min(10.0)) as i64);

@@ -354,6 +354,9 @@ impl Fleet {
             return;
         };
         let blind = car.blind(now);
+        if car.blind_logged && !blind {
+            car.back_at = now;
+        }
         let silent = car.stale_for(now).filter(|_| !blind);
         if silent.is_some() != car.stale_logged {
             car.stale_logged = silent.is_some();
@@ -555,6 +558,39 @@ mod tests {
         fleet.apply(&health(7 * SECOND, 2, Delivery::Live, State::Localized));
         let texts: Vec<_> = fleet.log().since(0).map(|entry| entry.text.as_str()).collect();
         assert_eq!(texts, ["BLIND: nothing comes from the car", "link is back"]);
+    }
+
+    // The first message after a cut once raised a second alarm: no health message for as long as the cut.
+    #[test]
+    fn a_cut_is_one_alarm() {
+        const TENTH: i64 = SECOND / 10;
+        let mut fleet = Fleet::default();
+        fleet.apply(&appeared(0));
+        for i in 0..250 {
+            if i < 50 {
+                fleet.apply(&health(i * TENTH, i as u64 + 1, Delivery::Live, State::Localized));
+            }
+            fleet.tick(i * TENTH);
+        }
+        let back = 25 * SECOND;
+        let event = Event {
+            kind: EventKind::SearchStarted,
+            update: 1,
+            who: None,
+            command: None,
+        };
+        fleet.apply(&message(
+            back,
+            1,
+            Delivery::Live,
+            Topic::Event,
+            Telemetry::Event(event),
+        ));
+        fleet.tick(back + TENTH);
+        assert_ne!(fleet.view(back + TENTH)[0].state, "STALE");
+        fleet.apply(&health(back + TENTH, 51, Delivery::Live, State::Localized));
+        assert_eq!(fleet.log().alarms(), 1, "BLIND");
+        assert_eq!(fleet.view(back + TENTH)[0].state, "LOCALIZED");
     }
 
     /// A car of which only its load comes once stayed "LOCALIZED".

@@ -1,5 +1,7 @@
 //! The figures of one car.
 
+use std::collections::BTreeSet;
+
 use super::svg::{Plot, WIDTH, escape};
 use super::timeline::Second;
 use super::{CarReport, error_of};
@@ -123,21 +125,33 @@ fn laps(car: &CarReport) -> Option<(String, String)> {
     let mut times = if good.is_empty() { all } else { good };
     times.sort_by(f64::total_cmp);
     let (best, median) = (*times.first()?, times[times.len() / 2]);
-    let (first, last) = (car.laps.first()?.lap, car.laps.last()?.lap);
     // Slow laps are drawn at the upper end, so that the others can be told apart.
     let high = (median + 2.5 * (median - best))
         .max(median * 1.03)
         .min(*times.last()? + 0.1 * median);
     let low = best - 0.15 * (high - best).max(0.02 * best);
     let mut plot = Plot::new(
-        [f64::from(first) - 0.5, f64::from(last) + 0.5],
+        [0.5, car.laps.len() as f64 + 0.5],
         [low, high],
-        ["lap", "lap time [s]"],
+        ["laps in the order driven", "lap time [s]"],
     );
     plot.limit(median);
+    // A car that starts again counts its laps from the beginning.
+    let heats = car
+        .laps
+        .windows(2)
+        .enumerate()
+        .filter(|(_, pair)| pair[1].lap <= pair[0].lap);
+    plot.marks(
+        "switch",
+        heats.map(|(i, pair)| {
+            let text = format!("new run, {}", pair[1].set);
+            (i as f64 + 1.5, text)
+        }),
+    );
     plot.dots(
         "lap time [s]",
-        car.laps.iter().map(|lap| {
+        (1..).zip(&car.laps).map(|(number, lap)| {
             let class = match lap.void {
                 Some(_) => "hollow",
                 None if lap.time_s <= best => "best",
@@ -147,7 +161,7 @@ fn laps(car: &CarReport) -> Option<(String, String)> {
                 .void
                 .map_or_else(String::new, |reason| format!(", does not count: {reason}"));
             let title = format!("lap {}: {:.3} s on {}{why}", lap.lap, lap.time_s, lap.set);
-            (class, [f64::from(lap.lap), lap.time_s], title)
+            (class, [f64::from(number), lap.time_s], title)
         }),
     );
     Some(plot.finish())
@@ -274,14 +288,24 @@ fn error(car: &CarReport) -> Option<(String, String)> {
     let seconds = |at: i64| (at - first) as f64 * 1e-9;
     // One point per pixel, each the worst of its interval.
     let slots = WIDTH as usize;
+    let slot = |at: i64| {
+        let slot = (at - first) as f64 / (last - first + 1) as f64 * slots as f64;
+        (slot as usize).min(slots - 1)
+    };
     let mut worst = vec![f64::NAN; slots];
     for spot in poses {
         if let Some([distance, ..]) = error_of(spot, truths) {
-            let slot = (spot.sensor - first) as f64 / (last - first + 1) as f64 * slots as f64;
-            let slot = &mut worst[(slot as usize).min(slots - 1)];
+            let slot = &mut worst[slot(spot.sensor)];
             *slot = slot.max(distance * 100.0);
         }
     }
+    // A pixel without a pose is no gap, a second is.
+    let pauses = poses
+        .windows(2)
+        .filter(|pair| pair[1].sensor - pair[0].sensor > 1_000_000_000);
+    let gaps: BTreeSet<usize> = pauses
+        .flat_map(|pair| slot(pair[0].sensor) + 1..slot(pair[1].sensor))
+        .collect();
     let most = worst
         .iter()
         .copied()
@@ -294,12 +318,14 @@ fn error(car: &CarReport) -> Option<(String, String)> {
         ["time since the first pose [s]", "distance from the truth [cm]"],
     );
     let step = seconds(last) / slots as f64;
-    let points = worst.iter().enumerate().map(|(i, e)| [i as f64 * step, *e]);
+    let points = worst
+        .iter()
+        .enumerate()
+        .filter(|(i, e)| e.is_finite() || gaps.contains(i));
     plot.line(
         "main",
         "distance from the truth [cm]",
-        // A pixel without a pose is no gap.
-        points.filter(|[_, e]| e.is_finite()),
+        points.map(|(i, e)| [i as f64 * step, *e]),
     );
     Some(plot.finish())
 }

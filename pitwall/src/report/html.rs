@@ -67,7 +67,7 @@ pub(super) fn page(report: &Report) -> String {
 
 /// The paper's table I, from this recording.
 fn table_one(report: &Report) -> String {
-    let mut text = "<h2>Laps by set</h2><div class=\"wide\"><table><tr><th>car, set</th><th>laps</th><th>void</th><th>lap time: median [s]</th><th>middle half [s]</th><th>mean [s]</th>\
+    let mut text = "<h2>Laps by set</h2><div class=\"wide\" tabindex=\"0\" role=\"region\" aria-label=\"laps by set\"><table><tr><th>car, set</th><th>laps</th><th>void</th><th>lap time: median [s]</th><th>middle half [s]</th><th>mean [s]</th>\
                     <th>distance from the line [cm]</th><th>alignment [%]</th><th>CPU [% of a core]</th></tr>"
         .to_owned();
     let mut rows = 0;
@@ -169,7 +169,7 @@ fn alarms(car: &CarReport) -> String {
     if car.alarm_list.is_empty() {
         return String::new();
     }
-    let mut text = "<h3>Alarms</h3><div class=\"wide\"><table class=\"words\"><tr><th>time [s]</th><th>lap</th><th>place [m]</th><th>alarm</th></tr>".to_owned();
+    let mut text = "<h3>Alarms</h3><div class=\"wide\" tabindex=\"0\" role=\"region\" aria-label=\"alarms\"><table class=\"words\"><tr><th>time [s]</th><th>lap</th><th>place [m]</th><th>alarm</th></tr>".to_owned();
     for alarm in car.alarm_list.iter().take(MOST) {
         let cells = [
             alarm.lap.map_or_else(|| "–".to_owned(), |lap| lap.to_string()),
@@ -226,7 +226,7 @@ fn laps(car: &CarReport) -> String {
     let sectors: Vec<_> = (0..SECTORS)
         .map(|i| least(&move |lap| lap.sectors_s[i].filter(|_| lap.void.is_none())))
         .collect();
-    let mut text = "<h3>Laps</h3><div class=\"wide\"><table><tr><th>lap</th><th>time [s]</th><th>to best</th><th>S1</th><th>S2</th><th>S3</th><th>set</th>\
+    let mut text = "<h3>Laps</h3><div class=\"wide\" tabindex=\"0\" role=\"region\" aria-label=\"laps\"><table><tr><th>lap</th><th>time [s]</th><th>to best</th><th>S1</th><th>S2</th><th>S3</th><th>set</th>\
                     <th>slipping [%]</th><th>alignment [%]</th><th>off the line [cm]</th><th>void because</th></tr>"
         .to_owned();
     for lap in &car.laps {

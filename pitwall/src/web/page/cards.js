@@ -21,7 +21,7 @@ const COLOURS = ["#5aa9ff", "#ff9d5c", "#b98cff", "#2fd0c8", "#ff6fae", "#c9c93a
 export const colourOf = (index) => COLOURS[index % COLOURS.length];
 
 export const fixed = (value, digits, unit = "") =>
-  value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(digits) + unit;
+  value === null || value === undefined || !Number.isFinite(value) ? "–" : value.toFixed(digits).replace(/^-(0\.?0*)$/, "$1") + unit;
 
 /// Formats a duration: 7 s, 3:05, 1:02:30.
 export const lasting = (s) => {
@@ -64,7 +64,6 @@ export const FACTS = [
   ["update p99", (c) => ms(c.load && c.load.update_us.p99 / 1e3), (c) => c.load?.update_us.p99 > 20e3, "time of a filter update"],
   ["CPU", (c) => fixed(c.load && c.load.cpu_process * 100, 0, " %"), null, "of one core, by the car's node"],
   ["temp.", (c) => fixed(c.load?.temperature, 0, " °C"), (c) => c.load?.temperature > 80 || c.load?.throttled, "the hottest sensor; – if the machine does not report it"],
-  ["missing", (c) => String(missing(c)), null, "messages whose content was sent and has not arrived"],
   ["coverage", (c) => share(c.coverage), (c) => c.coverage < 0.999, "share of what the car sent that is here, of the streams that must be complete"],
 ];
 
@@ -99,7 +98,7 @@ export const verdict = (shadow) => {
 const READABLE = 190;
 
 /// Heights of a card [px]: whole, and with less on it.
-const WHOLE = 282, TIGHT = 226;
+const WHOLE = 274, TIGHT = 208;
 
 /// All cards. `acts` gives commands: choose(car, set), trial(car, set), revert(car), confirm(car), dismiss(car), shadow(car, set or null), search(car), open(car), select(car).
 export class Cards {

@@ -1,13 +1,14 @@
 // The large view of one car in the middle of the page: all causes, figures, two minutes of history, every set.
 
 import { plot } from "/chart.js";
-import { FACTS, STATES, recorderText, colourOf, element, fixed, lasting, setText, verdict } from "/cards.js";
+import { FACTS, STATES, recorderText, colourOf, element, fixed, missing, lasting, setText, verdict } from "/cards.js";
 
 const MORE = [
   ["spread along", (c) => fixed(c.health?.metrics?.spread_along, 3, " m"), (c) => c.health?.metrics?.spread_along > 0.4],
   ["spread across", (c) => fixed(c.health?.metrics?.spread_across, 3, " m"), (c) => c.health?.metrics?.spread_across > 0.15],
   ["residual", (c) => fixed(c.health?.metrics?.residual, 3, " m"), (c) => c.health?.metrics?.residual > 0.18],
   ["off the line", (c) => fixed(c.pose?.d_m, 2, " m")],
+  ["missing", (c) => String(missing(c))],
   ["lap", (c) => fixed(c.pose?.lap, 0)],
   ["memory", (c) => fixed(c.load && c.load.memory_process / 1e6, 0, " MB")],
   ["on the car", (c) => !c.load?.recorder ? "–" : c.load.recorder.error ? "FAILS" : c.load.recorder.recording ? "recording" : "not recording", (c) => c.load?.recorder?.error || c.load?.recorder?.dropped > 0],

@@ -165,18 +165,38 @@ const UNITS = {
   residual: " m", spread_along: " m", spread_across: " m", innovation: " m", innovation_angle: " rad", yaw_rate_residual: " rad/s", age_p50: " s", age_p99: " s",
 };
 
+/// What the metrics mean whose names do not say it.
+const MEANING = {
+  alignment: "share of the beams that end within 10 cm of a wall of the map, or 5 cm and a cell",
+  residual: "mean distance of the beams' ends from the nearest wall",
+  short_beams: "share of the beams more than 0.3 m shorter than in the map",
+  long_beams: "share of the beams more than 0.3 m longer than in the map",
+  no_return: "share of the beams that saw nothing",
+  ess_ratio: "effective sample size over the number of particles: low when few particles explain the scan",
+  w_ratio: "how well scans have fitted lately, over how well they usually do: 1 as usual",
+  spread_along: "standard deviation of the particles along the track",
+  spread_across: "standard deviation of the particles across the track",
+  second_mode: "mass of the second cluster of particles over that of the first: near 1 when two places look alike",
+  slip: "share of odometry's distance that was not driven: positive when wheels spin, negative when they lock",
+  yaw_rate_residual: "odometry's yaw rate less that of the pose",
+  innovation: "distance by which the last scan corrected the pose",
+  innovation_angle: "angle by which the last scan corrected the pose",
+  age_p50: "age of the pose, median of the last scans",
+  age_p99: "age of the pose, the oldest in a hundred",
+};
+
 /// Every number that the selected car has sent.
 export function showNumbers(table, car, pace) {
   const rows = [];
-  const add = (name, value) => rows.push([name, value]);
+  const add = (name, value, meaning) => rows.push([name, value, meaning]);
   if (car) {
     if (car.pose) {
       add("x, y", `${fixed(car.pose.x_m, 3)}, ${fixed(car.pose.y_m, 3)} m`);
       add("heading", fixed(car.pose.heading_rad * 180 / Math.PI, 1, "°"));
-      add("s, d", `${fixed(car.pose.s_m, 2)}, ${fixed(car.pose.d_m, 3)} m`);
+      add("s, d", `${fixed(car.pose.s_m, 2)}, ${fixed(car.pose.d_m, 3)} m`, "distance along the raceline, and to its left");
     }
     if (car.set) add("set", `${car.set.name}, revision ${car.set.revision} by ${car.set.who}`);
-    for (const [name, value] of Object.entries(car.health?.metrics ?? {})) add(name.replaceAll("_", " "), fixed(value, name === "particles" ? 0 : 3, UNITS[name]));
+    for (const [name, value] of Object.entries(car.health?.metrics ?? {})) add(name.replaceAll("_", " "), fixed(value, name === "particles" ? 0 : 3, UNITS[name]), MEANING[name]);
     if (car.load) {
       add("update p50 / p99 / max", ["p50", "p99", "max"].map((k) => fixed(car.load.update_us[k] / 1e3, 2)).join(" / ") + " ms");
       add("scan age p50 / p99", ["p50", "p99"].map((k) => fixed(car.load.scan_age_us[k] / 1e3, 1)).join(" / ") + " ms");
@@ -199,5 +219,5 @@ export function showNumbers(table, car, pace) {
     }
   }
   add("this page", pace);
-  table.replaceChildren(...rows.map(([name, value]) => rowOf("td", [[name, "quiet"], [value, ""]])));
+  table.replaceChildren(...rows.map(([name, value, meaning]) => rowOf("td", [[name, "quiet", meaning], [value, "", meaning]])));
 }

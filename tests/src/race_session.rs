@@ -7,8 +7,10 @@ use std::time::Duration;
 
 use anyhow::Context;
 use car_node::localization::LocalizerParameters;
-use car_node::race::{CarResult, Content, PoseSource, Quality, RaceSetup, Transmission, transmitted_race};
-use car_node::stress::Defect;
+use car_node::race::{
+    CarResult, Content, PoseSource, Quality, RaceSetup, Transmission, damaged_map, transmitted_race,
+};
+use car_node::stress::{Defect, Part};
 use car_node::wire;
 use pitwall::{Delivery, EventPayload, FleetEvent, Recorder, RecordingSummary, RunEnd};
 use protocol::{
@@ -61,6 +63,13 @@ impl RaceSession {
     pub fn record(&self, path: &Path) -> anyhow::Result<(Vec<Vec<CarResult>>, RecordingSummary)> {
         let track = Arc::new(Track::find(&self.track, None)?);
         let map = Arc::new(TrackMap::new(track.grid.clone())?);
+        // The cars of all heats have one map, which is the one that the pit wall gets.
+        let map = damaged_map(&track, &map, &self.defects, self.seed)?;
+        let of_sensors = self
+            .defects
+            .iter()
+            .filter(|defect| defect.kind.part() != Part::Map);
+        let of_sensors: Vec<_> = of_sensors.copied().collect();
         let recorder = Recorder::start(path)?;
         let mut session = Session {
             recorder,
@@ -79,7 +88,7 @@ impl RaceSession {
                 })
                 .collect::<anyhow::Result<_>>()?,
         };
-        session.arrive(&wire::map(&track.name, &track.grid, Some(&track.raceline)))?;
+        session.arrive(&wire::map(&track.name, map.grid(), Some(&track.raceline)))?;
         let mut results = Vec::new();
         for ((set, quality, laps), seed) in self.heats.iter().zip(self.seed..) {
             let parameters = LocalizerParameters::named(set).with_context(|| format!("no set {set}"))?;
@@ -90,7 +99,7 @@ impl RaceSession {
                 pose_source: PoseSource::Localizer(parameters),
                 speed_scale: 1.0,
                 seed,
-                defects: self.defects.clone(),
+                defects: of_sensors.clone(),
             };
             let mut fault = None;
             session.put_in_force(set, results.len() as u64 + 1)?;

@@ -1,6 +1,7 @@
 //! The report shows the same figures of a race as `car-node race --json`.
 
 use car_node::race::{CarResult, RaceSummary};
+use car_node::stress::DefectChoice;
 use pitwall::Report;
 use system_tests::RaceSession;
 
@@ -106,4 +107,22 @@ fn the_report_shows_the_figures_of_the_race() {
             near(&format!("{} {state}", car.car), *share, raced, 0.01);
         }
     }
+}
+
+// The pit wall once got the map without its defects, and found it right.
+#[test]
+fn a_wall_that_the_map_lacks_is_listed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("race.mcap");
+    let missing: DefectChoice = "wall-missing:mild".parse().expect("a defect");
+    let session = RaceSession {
+        cars: 1,
+        defects: vec![missing.one()],
+        ..RaceSession::two_heats()
+    };
+    session.record(&file).expect("a recording");
+    let html = Report::of(&file).expect("a good file").to_html();
+    let found = html.split_once("\"findings\":[").expect("the analysis").1;
+    let found = found.split_once(']').map_or(found, |(found, _)| found);
+    assert!(found.contains("\"disagreement\":\"not_drawn\""), "{found}");
 }

@@ -100,20 +100,21 @@ pub fn applies_to_races(kind: DefectKind) -> bool {
 }
 
 /// The map of the track with the defects that are those of maps; a defect that does not apply changes nothing.
-fn damaged_map(track: &Track, map: &Arc<TrackMap>, setup: &RaceSetup) -> Result<Arc<TrackMap>, SetUpError> {
+pub fn damaged_map(
+    track: &Track,
+    map: &Arc<TrackMap>,
+    defects: &[Defect],
+    seed: u64,
+) -> Result<Arc<TrackMap>, SetUpError> {
     let line = &track.raceline;
     let steps = (line.length() / 0.1).ceil() as usize;
     let path: Vec<Pose> = (0..steps)
         .map(|step| line.at(step as f64 * line.length() / steps as f64))
         .map(|point| Pose::new(point.x, point.y, point.heading))
         .collect();
-    let mut random = SmallRng::seed_from_u64(setup.seed);
+    let mut random = SmallRng::seed_from_u64(seed);
     let mut grid = None;
-    for defect in setup
-        .defects
-        .iter()
-        .filter(|defect| applies_to_races(defect.kind))
-    {
+    for defect in defects.iter().filter(|defect| applies_to_races(defect.kind)) {
         let before = grid.as_ref().unwrap_or_else(|| map.grid());
         if let Some((damaged, _)) = map_damage::damage(before, *defect, &path, &mut random) {
             grid = Some(damaged);
@@ -158,7 +159,7 @@ fn race_with(
         time: Duration::from_secs_f64(10.0 + 4.0 * expected),
     };
     let field = field(setup);
-    let map = damaged_map(track, map, setup)?;
+    let map = damaged_map(track, map, &setup.defects, setup.seed)?;
     let sensors = field.iter().map(|car| {
         // Every simulated car has a gyroscope.
         DamageChain::new(&setup.defects, car.lidar.base_link_from_laser, true, setup.seed)

@@ -165,9 +165,13 @@ impl WallCalibration {
         information += Matrix4::from_diagonal_element(UNKNOWN);
         let step = information.cholesky()?.solve(&gradient);
         let offset = known.offset - f64::from(step[3]);
-        let sound = on_walls as f64 >= LEAST_SHARE * looked_at as f64 && offset.abs() <= MOST_OFFSET;
+        let told = on_walls as f64 >= LEAST_SHARE * looked_at as f64;
         Some(Self {
-            offset: if sound { offset } else { known.offset },
+            offset: if told {
+                offset.clamp(-MOST_OFFSET, MOST_OFFSET)
+            } else {
+                known.offset
+            },
             scatter: f64::from(*median * SIGMA_OF_MEDIAN),
             // Of the points between those looked at, each has the same in common with its stretch.
             shared: Shared {

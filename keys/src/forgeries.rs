@@ -45,6 +45,8 @@ pub(crate) fn meaning(entry: &str) -> Option<Forgery> {
         "Query" if asked => format!("asked {car}"),
         "Declare Queryable" if asked || commanded => format!("would answer in the name of {car}"),
         "Put" | "Delete" if topic == Topic::Link => format!("sent {car} a report"),
+        // Nothing is published there: a token that zenoh passes on and withdraws looks like it.
+        "Put" | "Delete" if topic == Topic::Alive => return None,
         "Put" | "Delete" if !asked && !commanded => format!("published in the name of {car}"),
         "Liveliness Token" => format!("announced itself as {car}"),
         _ => return None,
@@ -135,6 +137,8 @@ mod tests {
             "Reply (ingress) on synpf/v1/car-1/pose",
             "Put (ingress) on synpf/v1/car-1/cmd/pose",
             "Put (ingress) on synpf/v1/_pitwall/recorder",
+            "Put (ingress) on synpf/v1/car-1/alive",
+            "Delete (ingress) on synpf/v1/car-1/alive/7",
             "Declare/Undeclare Queryable (ingress) on synpf/v1/car-1/map",
             "Put (egress) on synpf/v1/car-1/pose",
             "Put (ingress) on synpf/v1",

@@ -18,7 +18,9 @@ mod synthetic_bag;
 
 #[cfg(feature = "browser")]
 pub use browser::Browser;
-pub use bystanders::{alone, attack_factor, is_named, log_has, nothing_is_lost, received, three_cars};
+pub use bystanders::{
+    alone, attack_factor, is_named, log_has, nothing_is_lost, nothing_more_is_lost, received, three_cars,
+};
 pub use fake_car::{Behaviour, FakeCar};
 pub use link::Link;
 pub use race_session::RaceSession;

@@ -12,7 +12,7 @@ use pitwall::{Fleet, FleetService, PageOptions, PitWallOptions, PitWallServer, u
 use protocol::{Event, EventKind, Key, Stamps, Topic, encode};
 use system_tests::{
     Behaviour, FakeCar, alone, attack_factor as times, free_endpoint, is_named, log_has, named,
-    nothing_is_lost, received, router, stranger, three_cars, wait_until,
+    nothing_is_lost, nothing_more_is_lost, received, router, stranger, three_cars, wait_until,
 };
 use zenoh::qos::CongestionControl;
 
@@ -39,7 +39,7 @@ async fn announced_cars_are_bounded_and_forgotten() {
     // A real car makes room for itself.
     let cars = real_cars(&endpoint, &wall).await;
     assert!(wall.fleet().cars().count() <= Fleet::MOST_CARS);
-    nothing_is_lost(&wall, &cars).await;
+    nothing_more_is_lost(&wall, &cars).await;
     harm.close().await.expect("closed");
     wait_until("invented cars are forgotten", || {
         wall.fleet().cars().count() == cars.len()

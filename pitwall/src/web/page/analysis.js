@@ -72,6 +72,21 @@ function save(name, content, kind) {
 }
 
 /// About five round numbers in a range.
+/// By a lap's id, what to add to its name: the run, where the car has begun to count its laps anew in a session.
+function runsOf(laps) {
+  const cars = new Map();
+  for (const lap of [...laps].sort((a, b) => a.begun - b.begun)) {
+    const key = `${lap.session}/${lap.car}`;
+    const runs = cars.get(key) ?? [[]];
+    const last = runs.at(-1).at(-1);
+    if (last && lap.lap <= last.lap) runs.push([]);
+    runs.at(-1).push(lap);
+    cars.set(key, runs);
+  }
+  const several = [...cars.values()].filter((runs) => runs.length > 1);
+  return new Map(several.flatMap((runs) => runs.flatMap((run, i) => run.map((lap) => [lap.id, `, run ${i + 1}`]))));
+}
+
 function ticks(low, high) {
   const raw = (high - low) / 4;
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -234,6 +249,7 @@ export class Analysis {
     const first = !this.view;
     this.view = view;
     this.laps = new Map(view.laps.map((lap) => [lap.id, lap]));
+    this.runs = runsOf(view.laps);
     this.chosen = this.chosen.filter((id) => this.laps.has(id));
     if (!this.laps.has(this.reference)) this.reference = null;
     const cars = [...new Set(view.laps.map((lap) => `${lap.session}/${lap.car}`))];
@@ -254,7 +270,8 @@ export class Analysis {
     const sessions = new Set(this.view.laps.map((lap) => lap.session));
     return sessions.size > 1 ? `${key.slice(0, cut)}: ${key.slice(cut + 1)}` : key.slice(cut + 1);
   }
-  lapName(lap) { return `${this.carName(`${lap.session}/${lap.car}`)} lap ${lap.lap}`; }
+  /// Car and lap; and the run, where the car has begun to count anew.
+  lapName(lap) { return `${this.carName(`${lap.session}/${lap.car}`)} lap ${lap.lap}${this.runs.get(lap.id) ?? ""}`; }
 
   counting() { return this.view.laps.filter((lap) => lap.kind === "flying" && lap.time_s !== null); }
 
@@ -927,7 +944,7 @@ export class Analysis {
     const told = this.view.advice.filter((advice) => advice.channel || newest.get(advice.car) === advice.id);
     this.advice.replaceChildren(...told.slice(-60).reverse().map((advice) => {
       const line = make("li");
-      const show = button(`${advice.car} lap ${advice.lap}`, "show the evidence", () => {
+      const show = button(`${advice.car} lap ${advice.lap}${this.runs.get(advice.id) ?? ""}`, "show the evidence", () => {
         this.own = true;
         this.mode = "laps";
         if (this.laps.has(advice.reference)) this.reference = advice.reference;

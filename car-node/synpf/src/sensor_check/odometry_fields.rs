@@ -94,6 +94,7 @@ impl OdometryFields {
         let position_stood = same(message.pose.x, last.pose.x) && same(message.pose.y, last.pose.y);
         let stood = position_stood && same(message.pose.heading, last.pose.heading);
         let origin = message.pose.x == 0.0 && message.pose.y == 0.0;
+        let hung = self.repeats.is_some_and(|repeats| repeats >= REPEATS);
         if self.hangs(stood && !origin, message.twist == last.twist && by_twist > 0.0) {
             return Odometry {
                 pose: self.pose,
@@ -129,7 +130,7 @@ impl OdometryFields {
         if self.coarse {
             // Its steps say little of the way.
             (self.by_pose, self.by_twist, self.wrong_twist) = (0.0, 0.0, None);
-        } else if distance < FASTEST * dt && dt < GAP {
+        } else if distance < FASTEST * dt && dt < GAP && !hung {
             self.judge_twist(distance * step.x.signum(), mean[0] * dt);
         }
         self.poses.push_back((message.stamp, message.pose));

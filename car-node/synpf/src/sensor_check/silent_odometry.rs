@@ -61,6 +61,11 @@ const STRETCHES: u32 = 2;
 /// ...and messages of it that stood still by then.
 const MESSAGES: u32 = 3;
 
+/// No car changes its twist faster [m/s^2], [m/s^2], [rad/s^2]: a coefficient of friction of 1.2; a car that spins...
+const HARDEST: [f64; 3] = [12.0, 12.0, 100.0];
+/// ...beyond what two scans misjudge it [m/s], [rad/s]. Scans that jump to and fro are none of a car that drives.
+const UNSTEADY: f64 = 1.0;
+
 /// Scans that tell the place along the track to this \[m\] would show that the car moves: on tracks with bends in view they tell it to
 /// 0.3 to 0.6 cm, and along a wall that is drawn in cells still to 2 cm...
 const TELLS: f64 = 0.01;
@@ -109,8 +114,17 @@ impl SilentOdometry {
             self.begin(scan, driven);
             return None;
         }
+        let twist = motion.log().map(|v| v / seconds);
+        let steady = [0, 1, 2].iter().all(|&i| {
+            let change = (twist[i] - self.twist[i]).abs();
+            change < HARDEST[i] * seconds + UNSTEADY
+        });
+        if self.stretches > 0 && !steady {
+            self.begin(scan, driven);
+            return None;
+        }
         self.motion = self.motion * motion;
-        self.twist = motion.log().map(|v| v / seconds);
+        self.twist = twist;
         self.stretches += 1;
         self.keep(scan, driven);
         self.found = self.stretches >= STRETCHES && silent >= MESSAGES;

@@ -6,6 +6,8 @@ use std::collections::VecDeque;
 use localizer::{Odometry, SensorFinding, SensorFindings, Stamp, Twist};
 use maps::Pose;
 
+use super::{FASTEST, FASTEST_TURN};
+
 /// Completes odometry by what the other half says.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct OdometryFields {
@@ -24,9 +26,11 @@ pub(crate) struct OdometryFields {
     wrong_twist: Option<f64>,
     /// Some twist was not zero.
     twist_seen: bool,
-    /// Distance by the twist, the older stretches forgotten, and how much of it while the position stood still \[m\].
+    /// Distance by the twist, the older stretches forgotten; how much of it while the position stood still; and that by the
+    /// position \[m\].
     twist_distance: f64,
     twist_distance_standing: f64,
+    steps_distance: f64,
     /// The position moves in steps of several messages.
     coarse: bool,
     /// Messages on end that repeat one; None if the twist of that one was not new.
@@ -42,6 +46,9 @@ const STILL: [f64; 2] = [0.05, 0.6];
 /// A position is coarse when it stands still on more than the second share of the way by the twist, and fine below the first.
 const COARSE: [f64; 2] = [0.1, 0.3];
 
+/// Its steps, along both axes of a grid, make a way of so many times that by the twist.
+const STEPS: std::ops::Range<f64> = 0.6..1.6;
+
 /// So many messages on end that repeat a measured twist and pose are none.
 const REPEATS: u32 = 3;
 
@@ -56,9 +63,6 @@ const FITS: std::ops::Range<f64> = 0.6..1.6;
 
 /// A twist is derived from poses so far apart [s]: shorter is noise, longer is late.
 const SPAN: f64 = 0.045;
-
-/// A step by the pose beyond this speed is a jump [m/s].
-const FASTEST: f64 = 30.0;
 
 /// No message for so long: what the twist was in between is unknown \[s\].
 const GAP: f64 = 0.5;
@@ -102,7 +106,13 @@ impl OdometryFields {
                 ..received
             };
         }
-        self.judge_position(position_stood, by_twist);
+        if linear_x.abs() < FASTEST && angular.abs() < FASTEST_TURN {
+            self.judge_position(message.pose.distance(last.pose), by_twist);
+        } else {
+            // Poses of two frames, one among the other.
+            (self.twist_distance, self.twist_distance_standing) = (0.0, 0.0);
+            (self.steps_distance, self.coarse) = (0.0, false);
+        }
         let oriented = message.pose.heading.is_finite() && last.pose.heading.is_finite();
         if stood || !oriented {
             self.still += by_twist;
@@ -177,15 +187,17 @@ impl OdometryFields {
         self.repeats.is_some_and(|repeats| repeats >= REPEATS)
     }
 
-    /// Judges whether the position is coarse, by one step in which the car went so far by the twist \[m\].
-    fn judge_position(&mut self, stood: bool, by_twist: f64) {
+    /// Judges whether the position is coarse, by one step \[m\] in which the car went so far by the twist \[m\].
+    fn judge_position(&mut self, step: f64, by_twist: f64) {
         let keep = (-by_twist / MEMORY).exp();
         self.twist_distance = self.twist_distance * keep + by_twist;
-        self.twist_distance_standing =
-            self.twist_distance_standing * keep + if stood { by_twist } else { 0.0 };
+        self.steps_distance = self.steps_distance * keep + step;
+        let standing = if step > 0.0 { 0.0 } else { by_twist };
+        self.twist_distance_standing = self.twist_distance_standing * keep + standing;
         if self.twist_distance > 0.5 * MEMORY {
             let limit = COARSE[usize::from(!self.coarse)];
-            self.coarse = self.twist_distance_standing > limit * self.twist_distance;
+            self.coarse = self.twist_distance_standing > limit * self.twist_distance
+                && STEPS.contains(&(self.steps_distance / self.twist_distance));
         }
     }
 

@@ -106,13 +106,7 @@ impl OdometryFields {
                 ..received
             };
         }
-        if linear_x.abs() < FASTEST && angular.abs() < FASTEST_TURN {
-            self.judge_position(message.pose.distance(last.pose), by_twist);
-        } else {
-            // Poses of two frames, one among the other.
-            (self.twist_distance, self.twist_distance_standing) = (0.0, 0.0);
-            (self.steps_distance, self.coarse) = (0.0, false);
-        }
+        self.judge_position(message.pose.distance(last.pose), by_twist, &message.twist);
         let oriented = message.pose.heading.is_finite() && last.pose.heading.is_finite();
         if stood || !oriented {
             self.still += by_twist;
@@ -188,7 +182,13 @@ impl OdometryFields {
     }
 
     /// Judges whether the position is coarse, by one step \[m\] in which the car went so far by the twist \[m\].
-    fn judge_position(&mut self, step: f64, by_twist: f64) {
+    fn judge_position(&mut self, step: f64, by_twist: f64, twist: &Twist) {
+        if twist.linear_x.abs() > FASTEST || twist.angular.abs() > FASTEST_TURN {
+            // Poses of two frames, one among the other.
+            (self.twist_distance, self.twist_distance_standing) = (0.0, 0.0);
+            (self.steps_distance, self.coarse) = (0.0, false);
+            return;
+        }
         let keep = (-by_twist / MEMORY).exp();
         self.twist_distance = self.twist_distance * keep + by_twist;
         self.steps_distance = self.steps_distance * keep + step;

@@ -464,7 +464,7 @@ def recovers(observer, car, what, words, fault, namespace="", near=NEAR):
         named = [word for word in words if any(word in text for text in said)]
         good = back and took < RECOVERY + stalled and len(off) > 10 and mean < near and (named or not words)
         # Beside others' work, one is tried twice.
-        if good or attempt == 2 or stalled < 0.5:
+        if good or attempt == 2 or stalled < 0.2:
             break
         print(f"  note: {what}: again, since this machine stood still for {stalled:.1f} s", flush=True)
     check(back and took < RECOVERY + stalled, f"{what}: localized {took:.2f} s after its end")
@@ -473,7 +473,7 @@ def recovers(observer, car, what, words, fault, namespace="", near=NEAR):
         check(named, f"{what}: said, {(named or words)[0]!r}")
     if not good:
         reports = [(at - over, m.status[0].message) for at, m in observer.messages["/diagnostics"] if at > since]
-        print("\n".join(f"    {at:6.2f} s {text}" for at, text in reports), flush=True)
+        print("\n".join(f"    {at:6.2f} s {text}" for at, text in reports), *observer.log(since), sep="\n    ", flush=True)
 
 
 def pause(car, seconds):
@@ -531,8 +531,8 @@ def clocks(program, folder, track):
         recovers(observer, car, "the clock starts again at 0", back, lambda: step(-car.begin_stamp() - 20)())
         recovers(observer, car, "time stands still for 2 s", ["no scans"], lambda: pause(car, 2.0))
         recovers(observer, car, "time stands still for 5 s", ["no scans"], lambda: pause(car, 5.0))
-        # On a busy machine the rate is read off late messages: 0.4 to 0.6.
-        recovers(observer, car, "a simulator at half speed for 3 s", ["runs at 0.4", "runs at 0.5"], half_speed)
+        # On a busy machine the rate is read off late messages, and at first off some from before: 0.3 to 0.8.
+        recovers(observer, car, "a simulator at half speed for 3 s", [f"runs at 0.{tenth}" for tenth in range(3, 8)], half_speed)
     finally:
         stop(router, process, car)
 

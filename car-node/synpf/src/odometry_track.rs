@@ -22,6 +22,8 @@ pub(crate) struct OdometryTrack {
     driven: VecDeque<DrivenSums>,
     /// The last message, completed.
     last: Option<Odometry>,
+    /// How the pose went on in the last step that was no jump [m/s], [m/s], [rad/s].
+    pace: [f64; 3],
     fields: OdometryFields,
     grip: WheelGrip,
     /// Messages on end that stood still, but for those in which the wheels braked.
@@ -39,9 +41,9 @@ pub(crate) struct OdometryTrack {
     discontinuity: Option<Pose>,
 }
 
-/// A step is a jump if it differs by more than this from what the twist says \[m\], \[rad\]...
+/// A step is a jump if it differs by more than this from what the twist says, and from the step before \[m\], \[rad\]...
 const JUMP: [f64; 2] = [0.3, 0.3];
-/// ...plus this much per second, for a twist that is wrong [m/s], [rad/s].
+/// ...plus as far as a car comes with the acceleration of [`TWIST_RATE`], but no more than this per second [m/s], [rad/s].
 const JUMP_RATE: [f64; 2] = [3.0, 3.0];
 
 /// A twist changes by no more than this from one message to the next [m/s], [rad/s]...
@@ -148,16 +150,15 @@ impl OdometryTrack {
             linear_y: towards(last.twist.linear_y, odometry.twist.linear_y, dt, 0),
             ..odometry.twist
         };
-        let expected = Pose::exp(mean_twist(&last.twist, &reachable).map(|v| v * dt.min(1.0)));
-        let off = [
-            step.distance(expected),
-            maps::wrap_angle(step.heading - expected.heading).abs(),
-        ];
-        let possible = [JUMP[0] + JUMP_RATE[0] * dt, JUMP[1] + JUMP_RATE[1] * dt];
+        let by_twist = mean_twist(&last.twist, &reachable);
+        let margin = jump_margin(dt);
+        let goes_on = [by_twist, self.pace]
+            .iter()
+            .any(|pace| is_near(step, Pose::exp(pace.map(|v| v * dt.min(1.0))), margin));
         let speed = last.twist.linear_x.hypot(last.twist.linear_y);
-        let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + possible[0];
+        let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + margin[0];
         let before = self.points.back().expect("a last message has a point").pose;
-        if (off[0] > possible[0] || off[1] > possible[1]) && !gone_on {
+        if !goes_on && !gone_on {
             // A twist that came with a jump may be told from it.
             odometry.twist = last.twist;
             self.last = Some(odometry);
@@ -165,6 +166,8 @@ impl OdometryTrack {
             let jump = before * step * (before * expected).inverse();
             self.discontinuity = Some(self.discontinuity.map_or(jump, |earlier| earlier * jump));
             step = expected;
+        } else {
+            self.pace = step.log().map(|v| v / dt);
         }
         let gyro = self.turn_by_gyro(last.stamp, odometry.stamp);
         let (arc, twist) = self.corrected(&odometry, step.log(), gyro.filter(|_| use_imu), dt);
@@ -444,6 +447,15 @@ fn mean_twist(a: &Twist, b: &Twist) -> [f64; 3] {
     ]
 }
 
+/// By how much a step over `dt` \[s\] may differ from what was to be expected \[m\], \[rad\].
+fn jump_margin(dt: f64) -> [f64; 2] {
+    [0, 1].map(|kind| JUMP[kind] + (0.5 * TWIST_RATE[kind] * dt * dt).min(JUMP_RATE[kind] * dt))
+}
+
+fn is_near(a: Pose, b: Pose, within: [f64; 2]) -> bool {
+    a.distance(b) < within[0] && maps::wrap_angle(a.heading - b.heading).abs() < within[1]
+}
+
 /// A component of a twist on its way from one value to another, as far as a car can come in `dt` \[s\]. `kind` is 0 for a speed, 1
 /// for a yaw rate.
 fn towards(from: f64, to: f64, dt: f64, kind: usize) -> f64 {
@@ -517,6 +529,39 @@ mod tests {
         assert!(pose.distance(circle(9).pose) < 0.05, "{pose:?}");
         assert!((pose.heading - circle(9).pose.heading).abs() < 0.1, "{pose:?}");
         assert!((twist.angular - circle(9).twist.angular).abs() < 1e-6);
+    }
+
+    /// A robot that stands, and after a pause of 0.2 s a message of another frame, with a twist told from the poses of both.
+    #[test]
+    fn a_twist_told_from_a_jump_does_not_make_it_a_motion() {
+        let standing = |stamp: f64| Odometry {
+            stamp: Stamp(0).plus(stamp),
+            pose: Pose::IDENTITY,
+            twist: Twist::default(),
+        };
+        let mut jumped = standing(0.71);
+        jumped.pose = Pose::new(0.03, -0.95, -1.83);
+        jumped.twist = Twist {
+            linear_x: 4.5,
+            linear_y: 0.0,
+            angular: -8.6,
+        };
+        let mut track = track([standing(0.24), standing(0.48), jumped]);
+        let (pose, _) = track.at(jumped.stamp, 0.0).expect("covered");
+        assert!(pose.distance(Pose::IDENTITY) < 0.01, "{pose:?}");
+        assert!(track.take_discontinuity().is_some());
+        // A car that goes off as hard as it can does move.
+        let hardest = |i: i32| {
+            let t = 0.1 * f64::from(i);
+            let mut message = standing(t);
+            message.pose.x = 0.5 * 10.0 * t * t;
+            message.twist.linear_x = 10.0 * t;
+            message
+        };
+        let (pose, _) = self::track((0..8).map(hardest))
+            .at(hardest(7).stamp, 0.0)
+            .expect("covered");
+        assert!((pose.x - hardest(7).pose.x).abs() < 1e-6, "{pose:?}");
     }
 
     #[test]

@@ -107,8 +107,9 @@ impl SilentOdometry {
         }
         let claimed = driven.since(&self.driven);
         let claimed = laser * Pose::exp([claimed.distance, 0.0, claimed.turn]) * base;
-        let variance = pair.variance(&[claimed, moved]);
-        let odds = 0.5 * (pair.cost(claimed, variance) - pair.cost(moved, variance));
+        let odds = pair.variance(&[claimed, moved]).map_or(0.0, |variance| {
+            0.5 * (pair.cost(claimed, variance) - pair.cost(moved, variance))
+        });
         let fast = (MOVES * seconds..FASTEST * seconds).contains(&distance);
         if odds < SURE || !fast || motion.heading.abs() > FASTEST_TURN * seconds {
             self.begin(scan, driven);

@@ -72,7 +72,9 @@ impl Standstill {
             return 0.0;
         };
         let motions = [Pose::IDENTITY, laser, pair.best_motion(laser)];
-        let variance = pair.variance(&motions);
+        let Some(variance) = pair.variance(&motions) else {
+            return 0.0;
+        };
         let [stood, claimed, best] = motions.map(|motion| pair.cost(motion, variance));
         // The best one fits a little better by its freedom alone.
         if stood - best > 2.0 * SURE {

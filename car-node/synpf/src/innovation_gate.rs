@@ -8,11 +8,15 @@
 //! Such a correction needs one of two reasons. Either the scan fits there as scans usually do, and the car can have moved so far
 //! since a scan last moved the pose: tyres near their limit slide, and a car that grips can be hit. Or scans ask for the same place for a while: what stands in view goes by, a wrong
 //! pose stays.
+//!
+//! Where hardly more than half of a view lies on walls, no fit is believed for fitting as usual, and odometry's errors are those that it
+//! has shown ([`OdometryDrift`]), as far as they are small.
 
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::estimate::Estimate;
+use crate::odometry_drift::{Fitted, OdometryDrift};
 use crate::recovery::InDoubt;
 
 /// What the gate knows of the scans so far.
@@ -25,6 +29,7 @@ pub(crate) struct InnovationGate {
     /// Time since the tyres were last near their limit \[s\].
     gripping: f64,
     refused: Option<Refused>,
+    drift: OdometryDrift,
 }
 
 /// The correction that the latest scans have asked for in vain.
@@ -78,6 +83,13 @@ const SLID: f64 = 0.5;
 /// After so long a way on which scans ask for one place it is believed [m]: half the depth of what one obstacle hides.
 const BELIEVED_AFTER: f64 = 1.0;
 
+/// Where fewer end points lie on walls, people and cars fill the view. Points up to 0.3 m beside a wall count in part, so that this is
+/// about half of them.
+const FILLED: f64 = 0.6;
+
+/// In such a view a place is believed after this way \[m\]: people stand along a whole bend.
+const BELIEVED_AFTER_FILLED: f64 = 4.0;
+
 /// Corrections that differ by less lead to one place \[m\], \[rad\].
 const SAME: [f64; 2] = [0.2, 0.1];
 
@@ -88,6 +100,7 @@ impl Default for InnovationGate {
             held: 0.0,
             gripping: 0.0,
             refused: None,
+            drift: OdometryDrift::default(),
         }
     }
 }
@@ -105,9 +118,22 @@ impl InnovationGate {
         (motion, seconds): (Pose, f64),
     ) -> Verdict {
         let usual = on_walls >= AS_USUAL * self.usual_fit;
-        if is_likely(predicted.pose, covariance, found)
-            && (usual || is_likely(reckoned.pose, &reckoned.covariance, found))
-        {
+        let filled = on_walls < FILLED;
+        let drift = self
+            .drift
+            .covariances(self.grips(), motion, [predicted.pose, reckoned.pose])
+            .filter(|_| filled);
+        let by_reckoning = is_likely(reckoned.pose, &reckoned.covariance, found);
+        let explained = match &drift {
+            Some([own, whole]) => {
+                by_reckoning
+                    && is_likely(predicted.pose, own, found)
+                    && is_likely(reckoned.pose, whole, found)
+            }
+            None => usual || by_reckoning,
+        };
+        let usual = usual && drift.is_none();
+        if is_likely(predicted.pose, covariance, found) && explained {
             return if usual { Verdict::Believed } else { Verdict::Likely };
         }
         let correction = found.since(predicted.pose);
@@ -120,7 +146,12 @@ impl InnovationGate {
             slid || found.distance(predicted.pose) < FASTEST * (self.held + seconds) + 3.0 * spread;
         // Many places fit as well as a pose that usually fits badly.
         let fits = usual && on_walls >= AS_USUAL * LEAST_USUAL;
-        let asked_for_long = asked.is_some_and(|refused| refused.way > BELIEVED_AFTER);
+        let long = if drift.is_some() {
+            BELIEVED_AFTER_FILLED
+        } else {
+            BELIEVED_AFTER
+        };
+        let asked_for_long = asked.is_some_and(|refused| refused.way > long);
         if fits && possible || asked_for_long {
             Verdict::Believed
         } else {
@@ -131,6 +162,24 @@ impl InnovationGate {
     /// Whether the tyres have been far from their limit for a while.
     pub(crate) fn grips(&self) -> bool {
         self.gripping > SLID
+    }
+
+    /// Takes in a fit where this share of the end points lies on walls, and odometry's motion and the time \[s\] since the scan before.
+    pub(crate) fn learn_drift(
+        &mut self,
+        pose: Pose,
+        on_walls: f64,
+        (held, believed): (bool, bool),
+        since_before: (Pose, f64),
+    ) {
+        let fitted = Fitted {
+            pose,
+            held,
+            believed,
+            usual: on_walls >= AS_USUAL * self.usual_fit,
+            grips: self.gripping > 0.0,
+        };
+        self.drift.learn(fitted, since_before);
     }
 
     /// Takes in the share of the end points that lie on walls at the estimate, after `driven` \[m\].
@@ -252,6 +301,39 @@ mod tests {
         assert_eq!(judged(&gate, ASIDE, 0.95), Verdict::Believed);
         // Cars that drive along look like walls.
         assert_eq!(judged(&gate, ASIDE, 0.88), Verdict::Refused);
+    }
+
+    /// People along a bend looked like its wall: the pose turned by 2 deg in a scan, which the set's odometry allows.
+    #[test]
+    fn in_a_filled_view_odometry_errs_as_it_has_shown() {
+        let mut gate = in_a_sound_map();
+        let loose = Matrix3::from_diagonal(&Vector3::new(2e-4, 2e-4, 1e-3));
+        let judged = |gate: &InnovationGate, turn: f64, on_walls| {
+            let found = Pose::new(0.01, 0.0, turn);
+            gate.judge(
+                (&known(), &loose),
+                &Estimate {
+                    covariance: loose,
+                    ..known()
+                },
+                found,
+                on_walls,
+                STEP,
+            )
+        };
+        assert_eq!(judged(&gate, 0.035, 0.5), Verdict::Likely, "nothing is known yet");
+        let mut pose = Pose::IDENTITY;
+        for _ in 0..80 {
+            pose = pose * STEP.0;
+            gate.learn_drift(pose, 0.95, (false, true), STEP);
+        }
+        assert_eq!(judged(&gate, 0.035, 0.5), Verdict::Refused);
+        assert_eq!(judged(&gate, 0.005, 0.5), Verdict::Likely);
+        assert_eq!(
+            judged(&gate, 0.035, 0.7),
+            Verdict::Likely,
+            "most of the view are walls"
+        );
     }
 
     #[test]

@@ -66,6 +66,7 @@ mod likelihood_field;
 mod motion_model;
 mod motion_noise;
 mod normal_pool;
+mod odometry_drift;
 mod odometry_track;
 mod parameters;
 mod particle_estimate;

@@ -266,6 +266,12 @@ impl SynPf {
         self.tracker
             .gate
             .note(refused, fit.held, since_before, acceleration);
+        self.tracker.gate.learn_drift(
+            estimate.pose,
+            fit.on_walls,
+            (fit.held, fit.believed),
+            since_before,
+        );
         if !fit.held {
             self.tracker.gate.learn_fit(fit.on_walls, step.motion.x);
         }

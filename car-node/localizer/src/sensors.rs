@@ -33,6 +33,16 @@ impl Scan {
     pub fn sweep(&self) -> f64 {
         self.time_increment * self.ranges.len().saturating_sub(1) as f64
     }
+
+    /// Least reading that is a measurement \[m\]: `range_min`; 0.1 m where that is none. No laser of this kind measures nearer than 0.05 m,
+    /// and drivers that state no least range mark beams without a return by smaller readings.
+    pub fn nearest(&self) -> f64 {
+        if self.range_min > 0.0 {
+            self.range_min.max(0.01)
+        } else {
+            0.1
+        }
+    }
 }
 
 /// A velocity in the frame of `base_link`.

@@ -45,7 +45,7 @@ impl Points {
         if !sound {
             return Err(Dropped::Malformed);
         }
-        let nearest = scan.range_min.max(parameters.min_range).max(0.01);
+        let nearest = scan.nearest().max(parameters.min_range);
         let mut points = Self::default();
         let piece = if sweep > 1e-4 {
             count.div_ceil(PIECES)

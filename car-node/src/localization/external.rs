@@ -256,7 +256,7 @@ impl External {
     /// End points of the beams with a return, in the frame of `base_link` at the scan's stamp \[m\], with the car's motion
     /// during the sweep taken out.
     fn end_points(&self, scan: &Scan, twist: Twist) -> Vec<[f32; 2]> {
-        let valid = scan.range_min.max(0.01)..scan.range_max.min(self.parameters.max_range);
+        let valid = scan.nearest()..scan.range_max.min(self.parameters.max_range);
         let moves = [twist.linear_x, twist.linear_y, twist.angular];
         let points = scan.ranges.iter().enumerate().filter_map(|(i, &range)| {
             let range = f64::from(range);

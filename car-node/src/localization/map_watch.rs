@@ -99,7 +99,7 @@ impl MapWatch {
         let (mut on_walls, mut beams) = (0, 0);
         for (beam, range) in scan.ranges.iter().enumerate().step_by(step) {
             let range = f64::from(*range);
-            if !(scan.range_min..reach).contains(&range) {
+            if !(scan.nearest()..reach).contains(&range) {
                 continue;
             }
             let along =

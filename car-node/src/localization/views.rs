@@ -39,7 +39,7 @@ pub(crate) fn scan_points(
         .enumerate()
         .step_by(step)
         .map(|(beam, range)| (beam, f64::from(*range)))
-        .filter(|(_, range)| (scan.range_min..scan.range_max).contains(range))
+        .filter(|(_, range)| (scan.nearest()..scan.range_max).contains(range))
         .map(|(beam, range)| {
             let angle = scan.angle_min + scan.angle_increment * beam as f64;
             let (sin, cos) = angle.sin_cos();

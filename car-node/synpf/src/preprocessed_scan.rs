@@ -55,7 +55,7 @@ const NO_POINT: u32 = u32::MAX;
 impl PreprocessedScan {
     /// Loads a scan, read by `geometry`. Its beams are transformed to the stamp by odometry, corrected by `slip`.
     ///
-    /// Readings that are not finite, below `range_min`, or from `range_max` or `max_range` on count as no return. A scan may
+    /// Readings that are not finite, below [`Scan::nearest`], or from `range_max` or `max_range` on count as no return. A scan may
     /// differ in geometry from the one before.
     pub(crate) fn load(
         &mut self,
@@ -83,7 +83,7 @@ impl PreprocessedScan {
         }
         self.choose(scan, geometry, parameters);
         self.base_link_from_laser = base_link_from_laser;
-        let nearest = (scan.range_min as f32).max(0.01);
+        let nearest = scan.nearest() as f32;
         let farthest = geometry.range_max.min(max_range) as f32;
 
         self.points.clear();
@@ -288,6 +288,20 @@ mod tests {
                 parameters,
             )
             .map(|()| preprocessed)
+    }
+
+    /// Half of the beams say 0.05 m for "no return", and the driver no least range: the pose went to the wall beside the car.
+    #[test]
+    fn readings_within_the_car_are_no_return() {
+        let ranges: Vec<f32> = (0..COUNT).map(|i| if i % 2 == 0 { 0.05 } else { 3.0 }).collect();
+        for (range_min, points) in [(0.0, COUNT / 2), (-1.0, COUNT / 2), (0.02, COUNT)] {
+            let scan = Scan {
+                range_min,
+                ..scan(ranges.clone())
+            };
+            let loaded = load(&scan, &driving(Twist::default()), &BeamParameters::default()).expect("sound");
+            assert_eq!(loaded.points.len(), points, "{range_min}");
+        }
     }
 
     #[test]

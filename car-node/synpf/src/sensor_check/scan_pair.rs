@@ -48,7 +48,7 @@ impl ScanPair {
         let stride = (scan.ranges.len() / READINGS).max(1);
         let valid = |range: f32| {
             let range = f64::from(range);
-            range > scan.range_min.max(0.05) && range < geometry.range_max.min(100.0)
+            range > scan.nearest().max(0.05) && range < geometry.range_max.min(100.0)
         };
         let direction = |i: usize| (scan.angle_min + geometry.angle_increment * i as f64).sin_cos();
         let beams = (turn / geometry.angle_increment).round();

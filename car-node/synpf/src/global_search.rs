@@ -308,16 +308,18 @@ impl Search {
     }
 
     /// The odometry has jumped, and the car is at `stayed`, where it would be without, or at `moved`, where it was carried,
-    /// or where it drove while messages were missing. None when it stayed; else a search has begun with both.
+    /// or where it drove while messages were missing: no farther than `reach` \[m\].
     pub(crate) fn after_jump(
         map: &TrackMap,
         scan: &PreprocessedScan,
         [stayed, moved]: [Pose; 2],
+        reach: f64,
         settings: &SearchSettings,
-    ) -> Option<Self> {
+    ) -> AfterJump {
+        let distance = stayed.distance(moved);
         // So little is the filter's to mend.
-        if stayed.distance(moved) < NEARBY && same_way(stayed, moved) {
-            return None;
+        if distance < NEARBY && same_way(stayed, moved) {
+            return AfterJump::Stayed;
         }
         let candidate = |pose| Candidate::new(map, scan, fitted(map, scan, pose, settings));
         // Odometry errs by a few per cent of its way, and turns; of places that fit alike it knows best.
@@ -327,16 +329,23 @@ impl Search {
             .flat_map(|on| (0..9).map(move |k| [on, k % 3 - 1, k / 3 - 1].map(f64::from)))
             .map(|[on, left, turn]| Pose::new(STEP * on, STEP * left, TURN * turn))
             .collect();
-        let (_, mut moved) = starts
+        let Some((_, mut moved)) = starts
             .into_par_iter()
             .map(|by| {
                 let found = candidate(moved * by);
                 (found.score - 0.5 * (by.x.hypot(by.y) / astray).powi(2), found)
             })
-            .max_by(|(a, _), (b, _)| a.total_cmp(b))?;
+            .max_by(|(a, _), (b, _)| a.total_cmp(b))
+        else {
+            return AfterJump::Stayed;
+        };
         let stayed = candidate(stayed);
-        if explains(stayed.score) && stayed.score > moved.score + settings.search.search_margin {
-            return None;
+        let margin = settings.search.search_margin;
+        if explains(stayed.score) && stayed.score > moved.score + margin {
+            return AfterJump::Stayed;
+        }
+        if explains(stayed.score) && distance > reach && moved.score < stayed.score + margin {
+            return AfterJump::Rival(moved);
         }
         // Perhaps it is neither.
         let mut since_check = f64::INFINITY;
@@ -346,7 +355,7 @@ impl Search {
             moved.estimate.covariance +=
                 Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, 0.0)) * astray.powi(2);
         }
-        Some(Self {
+        AfterJump::Search(Self {
             candidates: vec![moved, stayed],
             driven: 0.0,
             since_check,
@@ -354,6 +363,17 @@ impl Search {
             seconds: 0.0,
         })
     }
+}
+
+/// What a jump of the odometry means.
+#[derive(Debug, Clone)]
+pub(crate) enum AfterJump {
+    /// The car is where it would be without.
+    Stayed,
+    /// It probably is: no car comes so far in the time, but the scan could be from there, too.
+    Rival(Candidate),
+    /// It may be at either place, or at neither.
+    Search(Search),
 }
 
 /// A jump of odometry by less than this is no other place \[m\].
@@ -454,6 +474,9 @@ fn same_way(a: Pose, b: Pose) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::quality::tests::scan;
+    use maps::{Cell, OccupancyGrid};
+    use std::f64::consts::PI;
 
     fn candidate(x: f64, score: f64, scans: u32, seconds: f64) -> Candidate {
         let estimate = Estimate {
@@ -474,6 +497,31 @@ mod tests {
             &SearchSettings::default(),
         );
         assert_eq!(search.candidates, [elsewhere, older]);
+    }
+
+    /// Odometry that began anew put the car 53 m away, where a straight looks the same, and the right pose was given up.
+    #[test]
+    fn a_jump_that_no_car_makes_does_not_move_a_pose_that_fits() {
+        let cell = |column: usize, row: usize| match (column, row) {
+            (20..=22 | 217..=219, 20..=139) | (20..=219, 20..=22 | 137..=139) => Cell::Occupied,
+            (20..=219, 20..=139) => Cell::Free,
+            _ => Cell::Unknown,
+        };
+        // Turned by half a turn it is the same.
+        let grid = OccupancyGrid::from_fn(240, 160, 0.05, Pose::IDENTITY, cell);
+        let map = TrackMap::new(grid).expect("free space");
+        let (here, alike) = (Pose::new(4.0, 3.0, 0.3), Pose::new(8.0, 5.0, 0.3 - PI));
+        let scan = scan(&map, here);
+        let after =
+            |to, reach| Search::after_jump(&map, &scan, [here, to], reach, &SearchSettings::default());
+        assert!(
+            matches!(after(alike, 1.3), AfterJump::Rival(rival) if rival.estimate.pose.distance(alike) < 0.1)
+        );
+        assert!(
+            matches!(after(alike, 10.0), AfterJump::Search(_)),
+            "messages were missing"
+        );
+        assert!(matches!(after(Pose::new(9.0, 2.5, 1.0), 1.3), AfterJump::Stayed));
     }
 
     #[test]

@@ -177,9 +177,8 @@ impl InnovationGate {
             held,
             believed,
             usual: on_walls >= AS_USUAL * self.usual_fit,
-            grips: self.gripping > 0.0,
         };
-        self.drift.learn(fitted, since_before);
+        self.drift.learn(fitted, self.gripping > 0.0, since_before);
     }
 
     /// Takes in the share of the end points that lie on walls at the estimate, after `driven` \[m\].

@@ -56,8 +56,6 @@ pub(crate) struct Fitted {
     pub(crate) believed: bool,
     /// As many end points lie on walls as usual.
     pub(crate) usual: bool,
-    /// The tyres are not near their limit.
-    pub(crate) grips: bool,
 }
 
 /// Errors are compared over this \[s\]: a bend, a braking. Odometry errs by the same share for so long.
@@ -81,8 +79,8 @@ const VARYING: f64 = 1.5;
 const FIT: [f64; 2] = [0.005, 0.004];
 
 impl OdometryDrift {
-    /// Takes in a fit, and odometry's motion and the time \[s\] since the scan before.
-    pub(crate) fn learn(&mut self, fitted: Fitted, (motion, seconds): (Pose, f64)) {
+    /// Takes in a fit, whether the tyres grip, and odometry's motion and the time \[s\] since the scan before.
+    pub(crate) fn learn(&mut self, fitted: Fitted, grips: bool, (motion, seconds): (Pose, f64)) {
         for (driven, over) in self.since.iter_mut().zip([!fitted.held, fitted.believed]) {
             driven.add(motion);
             if over {
@@ -96,7 +94,7 @@ impl OdometryDrift {
         };
         stretch.motion = stretch.motion * motion;
         stretch.seconds += seconds;
-        stretch.gripping &= fitted.grips;
+        stretch.gripping &= grips;
         stretch.driven.add(motion);
         if stretch.seconds > 2.0 * STRETCH.max(2.0 * seconds) {
             self.stretch = None;
@@ -195,9 +193,8 @@ mod tests {
                 held: false,
                 believed: true,
                 usual: true,
-                grips,
             };
-            drift.learn(fitted, (told, 0.025));
+            drift.learn(fitted, grips, (told, 0.025));
         }
         drift
     }
@@ -241,9 +238,8 @@ mod tests {
                 held: true,
                 believed: false,
                 usual: false,
-                grips: true,
             };
-            drift.learn(fitted, (motion, 0.025));
+            drift.learn(fitted, true, (motion, 0.025));
         }
         assert_eq!(drift.shares, before);
         let [along, ..] = deviations(&drift, true, motion).expect("known");

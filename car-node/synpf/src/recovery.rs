@@ -28,7 +28,7 @@ use self::rivals::{Incumbent, Rival, Rivals};
 use self::scan_likelihood::fit_of;
 use crate::estimate::Estimate;
 use crate::global_search::{
-    Candidate, GlobalCheck, GlobalCheckOutcome, Search, SearchSettings, global_check, offset,
+    AfterJump, Candidate, GlobalCheck, GlobalCheckOutcome, Search, SearchSettings, global_check, offset,
 };
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
@@ -233,6 +233,9 @@ const STANDING: (f64, f64) = (2.0, 0.3);
 
 /// Log odds beyond which no more is said.
 const MOST_TRUST: f64 = 25.0;
+
+/// No car of this kind drives faster [m/s].
+const FASTEST: f64 = 30.0;
 
 /// A correction of the prediction larger than this is no motion of the car \[m\].
 const PLAUSIBLE: f64 = 0.3;
@@ -440,11 +443,14 @@ impl Recovery {
         if !self.parameters.recover {
             return Decision::Keep;
         }
+        let mut found = found;
         if let Some(displaced) = evidence.displaced {
-            return match Search::after_jump(map, scan, [estimate.pose, displaced], &self.settings) {
-                Some(search) => self.give_up(search),
-                None => Decision::Keep,
-            };
+            let reach = FASTEST * evidence.seconds + LEAP;
+            match Search::after_jump(map, scan, [estimate.pose, displaced], reach, &self.settings) {
+                AfterJump::Stayed => return Decision::Keep,
+                AfterJump::Search(search) => return self.give_up(search),
+                AfterJump::Rival(rival) => found.get_or_insert_default().push(rival),
+            }
         }
         if self.followed <= SETTLING {
             return Decision::Keep;

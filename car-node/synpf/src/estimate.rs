@@ -45,6 +45,11 @@ pub(crate) fn carry(from: Pose, to: Pose) -> Matrix3<f64> {
     Matrix3::new(1.0, 0.0, -dy, 0.0, 1.0, dx, 0.0, 0.0, 1.0)
 }
 
+/// Whether two poses differ by less than so much \[m\], \[rad\].
+pub(crate) fn are_near(a: Pose, b: Pose, within: [f64; 2]) -> bool {
+    a.distance(b) < within[0] && maps::wrap_angle(a.heading - b.heading).abs() < within[1]
+}
+
 /// Turns the covariance of x, y and heading from a frame at `heading` \[rad\] into the frame around it.
 pub(crate) fn rotation(heading: f64) -> Matrix3<f64> {
     let (sin, cos) = heading.sin_cos();

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 
 use crate::calibration::WallCalibration;
 use crate::correlative_match::seed;
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, are_near};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::recovery::scan_likelihood::{INDEPENDENT, score};
 use crate::scan_matcher::{RefinementParameters, refine};
@@ -464,7 +464,7 @@ pub(crate) fn offset(here: Pose, there: Pose) -> Vector3<f64> {
 }
 
 pub(crate) fn same(a: Pose, b: Pose) -> bool {
-    a.distance(b) < SAME[0] && same_way(a, b)
+    are_near(a, b, SAME)
 }
 
 fn same_way(a: Pose, b: Pose) -> bool {

@@ -15,7 +15,7 @@
 use maps::Pose;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, are_near};
 use crate::odometry_drift::{Fitted, OdometryDrift};
 use crate::recovery::InDoubt;
 
@@ -118,11 +118,12 @@ impl InnovationGate {
         (motion, seconds): (Pose, f64),
     ) -> Verdict {
         let usual = on_walls >= AS_USUAL * self.usual_fit;
-        let filled = on_walls < FILLED;
-        let drift = self
-            .drift
-            .covariances(self.grips(), motion, [predicted.pose, reckoned.pose])
-            .filter(|_| filled);
+        let drift = if on_walls < FILLED {
+            self.drift
+                .covariances(self.grips(), motion, [predicted.pose, reckoned.pose])
+        } else {
+            None
+        };
         let by_reckoning = is_likely(reckoned.pose, &reckoned.covariance, found);
         let explained = match &drift {
             Some([own, whole]) => {
@@ -139,7 +140,7 @@ impl InnovationGate {
         let correction = found.since(predicted.pose);
         let asked = self
             .refused
-            .filter(|refused| is_same(carried(refused.correction, motion), correction));
+            .filter(|refused| are_near(carried(refused.correction, motion), correction, SAME));
         let spread = (covariance[(0, 0)] + covariance[(1, 1)]).sqrt();
         let slid = !self.grips() && on_walls > CLEAR_VIEW;
         let possible =
@@ -213,7 +214,7 @@ impl InnovationGate {
         });
         self.refused = refused.map(|correction| {
             before
-                .filter(|before| is_same(before.correction, correction))
+                .filter(|before| are_near(before.correction, correction, SAME))
                 .unwrap_or(Refused { correction, way: 0.0 })
         });
     }
@@ -231,10 +232,6 @@ impl InnovationGate {
 /// A correction in the frame of the next prediction, of a pose that moved on with it.
 fn carried(correction: Pose, motion: Pose) -> Pose {
     motion.inverse() * correction * motion
-}
-
-fn is_same(a: Pose, b: Pose) -> bool {
-    a.distance(b) < SAME[0] && maps::wrap_angle(a.heading - b.heading).abs() < SAME[1]
 }
 
 fn is_likely(predicted: Pose, covariance: &Matrix3<f64>, found: Pose) -> bool {

@@ -7,6 +7,7 @@ use localizer::{Dropped, Odometry, SensorFindings, Stamp, Twist, YawRate};
 use maps::Pose;
 
 use crate::calibration::{Drive, SlipModel};
+use crate::estimate::are_near;
 use crate::sensor_check::{Corrections, DrivenSums, OdometryFields, STANDS, WheelGrip};
 
 /// The recent odometry. Jumps and known slip are taken out and gyroscope turns put in as messages arrive, so that
@@ -154,7 +155,7 @@ impl OdometryTrack {
         let margin = jump_margin(dt);
         let goes_on = [by_twist, self.pace]
             .iter()
-            .any(|pace| is_near(step, Pose::exp(pace.map(|v| v * dt.min(1.0))), margin));
+            .any(|pace| are_near(step, Pose::exp(pace.map(|v| v * dt.min(1.0))), margin));
         let speed = last.twist.linear_x.hypot(last.twist.linear_y);
         let gone_on = dt > GAP && step.x.hypot(step.y) < speed * dt + margin[0];
         let before = self.points.back().expect("a last message has a point").pose;
@@ -450,10 +451,6 @@ fn mean_twist(a: &Twist, b: &Twist) -> [f64; 3] {
 /// By how much a step over `dt` \[s\] may differ from what was to be expected \[m\], \[rad\].
 fn jump_margin(dt: f64) -> [f64; 2] {
     [0, 1].map(|kind| JUMP[kind] + (0.5 * TWIST_RATE[kind] * dt * dt).min(JUMP_RATE[kind] * dt))
-}
-
-fn is_near(a: Pose, b: Pose, within: [f64; 2]) -> bool {
-    a.distance(b) < within[0] && maps::wrap_angle(a.heading - b.heading).abs() < within[1]
 }
 
 /// A component of a twist on its way from one value to another, as far as a car can come in `dt` \[s\]. `kind` is 0 for a speed, 1

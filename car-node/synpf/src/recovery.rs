@@ -32,6 +32,7 @@ use crate::global_search::{
 };
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::quality::Quality;
+use crate::sensor_check::FASTEST;
 use crate::track_map::TrackMap;
 use crate::validation::Check;
 
@@ -233,9 +234,6 @@ const STANDING: (f64, f64) = (2.0, 0.3);
 
 /// Log odds beyond which no more is said.
 const MOST_TRUST: f64 = 25.0;
-
-/// No car of this kind drives faster [m/s].
-const FASTEST: f64 = 30.0;
 
 /// A correction of the prediction larger than this is no motion of the car \[m\].
 const PLAUSIBLE: f64 = 0.3;

@@ -141,7 +141,7 @@ const LONGEST_STRETCH: f64 = 0.5;
 const KEPT: usize = 128;
 
 /// No car of this kind drives faster [m/s]...
-const FASTEST: f64 = 30.0;
+pub(crate) const FASTEST: f64 = 30.0;
 /// ...or turns faster [rad/s].
 const FASTEST_TURN: f64 = 12.0;
 

@@ -7,7 +7,7 @@
 use maps::Pose;
 
 use super::scan_likelihood::{Explained, Pieces, explain, score};
-use crate::estimate::Estimate;
+use crate::estimate::{Estimate, are_near};
 use crate::global_search::{Candidate, SearchSettings, averaging, same};
 use crate::preprocessed_scan::PreprocessedScan;
 use crate::track_map::TrackMap;
@@ -188,7 +188,7 @@ impl Rivals {
 }
 
 fn nearby(a: Pose, b: Pose) -> bool {
-    a.distance(b) < NEARBY && maps::wrap_angle(a.heading - b.heading).abs() < 0.35
+    are_near(a, b, [NEARBY, 0.35])
 }
 
 #[cfg(test)]

@@ -197,6 +197,7 @@ impl Reading {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor_check::SensorCheck;
     use localizer::Stamp;
 
     /// A view of 180 deg onto corners whose distance changes by up to 2 m; another place shows others. Noise of 2 cm.
@@ -221,13 +222,7 @@ mod tests {
     }
 
     fn pair(a: &Scan, b: &Scan) -> ScanPair {
-        let geometry = ScanGeometry {
-            angle_increment: a.angle_increment,
-            time_increment: 0.0,
-            range_max: 20.0,
-            alternative: None,
-            lag: 0.0,
-        };
+        let geometry = SensorCheck::default().geometry(a);
         ScanPair::new(&a.ranges, b, &geometry, 0.0).expect("walls")
     }
 

@@ -94,6 +94,7 @@ impl Standstill {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sensor_check::SensorCheck;
     use localizer::{SensorFindings, Stamp};
 
     /// A room of 6 x 4 m seen from `x` along it, with some noise that repeats after many scans.
@@ -131,13 +132,7 @@ mod tests {
         for number in 0..80 {
             let t = f64::from(number) * 0.025;
             let scan = scan(speed * t, corridor, number);
-            let geometry = ScanGeometry {
-                angle_increment: scan.angle_increment,
-                time_increment: 0.0,
-                range_max: 20.0,
-                alternative: None,
-                lag: 0.0,
-            };
+            let geometry = SensorCheck::default().geometry(&scan);
             let driven = DrivenSums {
                 distance: -0.1 * t,
                 ..DrivenSums::default()
@@ -169,13 +164,7 @@ mod tests {
         for number in 0..20u32 {
             let t = f64::from(number) * 0.025;
             let scan = scan(5.0 * t, false, number);
-            let geometry = ScanGeometry {
-                angle_increment: scan.angle_increment,
-                time_increment: 0.0,
-                range_max: 20.0,
-                alternative: None,
-                lag: 0.0,
-            };
+            let geometry = SensorCheck::default().geometry(&scan);
             let driven = DrivenSums {
                 turn: 0.6 * t,
                 ..DrivenSums::default()
